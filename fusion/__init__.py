@@ -1,0 +1,1 @@
+"""Back ends, evaluation and the main job."""

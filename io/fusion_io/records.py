@@ -1,0 +1,154 @@
+"""What a log holds, as typed records.
+
+Conventions (the same in every package):
+
+* ``T_a_b`` maps points from frame b to frame a, so that ``T_world_camera @ p_camera == p_world``.
+* Time is integer nanoseconds on the clock of the log; a record's time is when it was measured.
+* Camera frame: x right, y down, z forward. IMU frame: whatever the log says.
+* Tangent vectors and covariances of SE(3) are ordered rotation (rad) first, then translation (m),
+  and perturb on the right: ``T = T_mean * Exp(xi)``, as in GTSAM.
+* SI units and radians; a name that holds anything else says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """Pinhole intrinsics of an image: K (3, 3) in pixels, distortion as in sensor_msgs/CameraInfo."""
+
+    width: int
+    height: int
+    K: FloatArray
+    distortion_model: str = ""
+    distortion: FloatArray = field(default_factory=lambda: np.zeros(0))
+    frame_id: str = "camera"
+
+    def scaled_to(self, width: int, height: int) -> CameraInfo:
+        """The same camera with its image resized; pixel centres are at integer coordinates."""
+        sx, sy = width / self.width, height / self.height
+        K = self.K.copy()
+        K[0] *= sx
+        K[1] *= sy
+        # Pixel centres are integers: the image's corner is at -0.5, and that is what scaling keeps.
+        K[0, 2] += 0.5 * sx - 0.5
+        K[1, 2] += 0.5 * sy - 0.5
+        return CameraInfo(width, height, K, self.distortion_model, self.distortion, self.frame_id)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> CameraInfo:
+        """The same camera seen through the window whose upper left pixel is (left, top)."""
+        K = self.K.copy()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        return CameraInfo(width, height, K, self.distortion_model, self.distortion, self.frame_id)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFrame:
+    """An undistorted image with the depth of its pixels.
+
+    image: (H, W) or (H, W, 3) uint8, colour as RGB. depth: (H, W) float32 metres along the optical
+    axis, 0 where there is none, or None for a frame without depth (it can still be a target).
+    """
+
+    stamp_ns: int
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None
+    camera: CameraInfo
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSeries:
+    """IMU samples in order of time, in the IMU's own frame.
+
+    stamps_ns (N,) strictly increasing; angular_velocity (N, 3) rad/s; linear_acceleration (N, 3)
+    m/s^2, gravity included (an IMU at rest shows +g upwards). The standard deviations are per
+    sample, as the log's covariance fields give them, or None where they are unknown.
+    """
+
+    stamps_ns: IntArray
+    angular_velocity: FloatArray
+    linear_acceleration: FloatArray
+    angular_velocity_std: float | None = None
+    linear_acceleration_std: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class PairEstimate:
+    """The pose of the target camera in the source camera's frame, with its covariance.
+
+    Rotations are kept as the unit quaternions that a message carries, not as matrices, so that
+    writing and reading change no bit and a replay starts from the same numbers.
+
+    quat_wxyz (4,), translation (3,) m; covariance (6, 6), rotation first, right perturbation.
+    hypotheses_quat_wxyz (M, 4), hypotheses_translation (M, 3), errors (M,): the hypotheses of the
+    last level and their photometric errors; M is 0 and winner is -1 where a pair did not come from
+    the network. imu_coverage: the share of the IMU window that was measured rather than filled.
+    """
+
+    source_stamp_ns: int
+    target_stamp_ns: int
+    quat_wxyz: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    winner: int = -1
+    hypotheses_quat_wxyz: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    hypotheses_translation: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    errors: FloatArray = field(default_factory=lambda: np.zeros(0))
+    imu_coverage: float = 1.0
+
+    @property
+    def T_source_target(self) -> RigidTransform:
+        """The estimate as a rigid transform."""
+        rotation = Rotation.from_quat(self.quat_wxyz, scalar_first=True)
+        return RigidTransform.from_components(self.translation, rotation)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from source to target."""
+        return (self.target_stamp_ns - self.source_stamp_ns) / NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses of the camera over time.
+
+    stamps_ns (N,) strictly increasing; poses: N transforms T_world_camera; covariances (N, 6, 6),
+    rotation first, right perturbation, or None where they are unknown (ground truth).
+    """
+
+    stamps_ns: IntArray
+    poses: RigidTransform
+    covariances: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def relative_to_first(self) -> Trajectory:
+        """The same trajectory in the frame of its first pose (covariances are in body axes: kept)."""
+        return Trajectory(self.stamps_ns, self.poses[0].inv() * self.poses, self.covariances)
+
+
+@dataclass(frozen=True, slots=True)
+class GnssFix:
+    """A position on the WGS84 ellipsoid: degrees, degrees, metres; covariance (3, 3) m^2 in ENU."""
+
+    stamp_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    covariance: FloatArray | None = None

@@ -1,0 +1,1 @@
+"""VIOLearner: the network, its training and its covariance."""
