@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -137,6 +137,13 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def at(self, stamps_ns: IntArray) -> RigidTransform:
+        """Poses at stamps (M,) that the trajectory spans: linear position, slerp rotation."""
+        t = (self.stamps_ns - self.stamps_ns[0]) / NANOSECONDS
+        at = (stamps_ns - self.stamps_ns[0]) / NANOSECONDS
+        position = np.stack([np.interp(at, t, axis) for axis in self.poses.translation.T], axis=-1)
+        return RigidTransform.from_components(position, Slerp(t, self.poses.rotation)(at))
 
     def relative_to_first(self) -> Trajectory:
         """The same trajectory in the frame of its first pose (covariances are in body axes: kept)."""

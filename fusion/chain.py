@@ -1,0 +1,217 @@
+"""From pair estimates to the raw trajectory: holes bridged, poses chained, covariance propagated to first order.
+
+A *step* is the motion between two stamps that follow each other; steps have no holes between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from itertools import accumulate, pairwise
+from operator import mul
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion_io.errors import LogError
+from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate, Trajectory
+
+# How far a motion strays from that of its neighbours: constant accelerations of this size, unknown in direction.
+# Brisk for a car, so that the covariance of a bridged hole is wide rather than narrow.
+UNKNOWN_ACCELERATION = 2.0  # m/s^2
+UNKNOWN_ANGULAR_ACCELERATION = 0.5  # rad/s^2
+# The same where a gyro has measured the rotation: an unknown constant rate, what is left of its bias and mounting.
+UNKNOWN_GYRO_RATE = 0.01  # rad/s
+
+# An IMU has a hole where samples are further apart than this many of its periods.
+MAX_IMU_PERIODS = 2.5
+
+
+class ImuWindows:
+    """The samples of an IMU over any interval of time, linear between them."""
+
+    def __init__(self, imu: ImuSeries) -> None:
+        self._stamps = imu.stamps_ns
+        self._values = np.hstack([imu.angular_velocity, imu.linear_acceleration])
+        self._longest_ns = MAX_IMU_PERIODS * np.median(np.diff(self._stamps)) if len(imu) > 1 else 0.0
+
+    def over(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Durations (M,) s that fill the interval, mean angular velocity (M, 3) and acceleration (M, 3) during each.
+
+        None where the samples do not reach from start to end without a hole.
+        """
+        first = int(np.searchsorted(self._stamps, start_ns, side="right")) - 1
+        last = int(np.searchsorted(self._stamps, end_ns))
+        if first < 0 or last >= len(self._stamps):
+            return None
+        stamps = self._stamps[first : last + 1]
+        if np.max(np.diff(stamps)) > self._longest_ns:
+            return None
+        knots = np.clip(stamps, start_ns, end_ns)
+        values = self._values[first : last + 1]
+        edges = [
+            values[k] + (values[k + 1] - values[k]) * ((knot - stamps[k]) / (stamps[k + 1] - stamps[k]))
+            for k, knot in ((0, start_ns), (-2, end_ns))
+        ]
+        values = np.vstack([edges[0], values[1:-1], edges[1]])
+        means = (values[1:] + values[:-1]) / 2
+        return np.diff(knots) / NANOSECONDS, means[:, :3], means[:, 3:]
+
+
+def adjoint(transform: RigidTransform) -> FloatArray:
+    """Ad(T) (..., 6, 6), rotation first: T Exp(xi) T^-1 = Exp(Ad(T) xi)."""
+    R, t = transform.rotation.as_matrix(), transform.translation
+    matrix = np.zeros((*R.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = R
+    matrix[..., 3:, :3] = np.cross(t[..., None, :], np.swapaxes(R, -1, -2)).swapaxes(-1, -2)
+    return matrix
+
+
+def chain(steps: Sequence[PairEstimate]) -> Trajectory:
+    """The raw trajectory of N steps: N + 1 poses in the first camera's frame, and their covariances.
+
+    With independent steps T_k+1 = T_k D_k the covariance is P_k+1 = Ad(D_k^-1) P_k Ad(D_k^-1)' + Q_k to first order
+    (Barfoot and Furgale, "Associating uncertainty with three-dimensional poses", 2014, for right perturbations).
+
+    Raises ValueError for no steps, and where one does not begin where the step before it ends.
+    """
+    if not steps:
+        raise ValueError("no steps")
+    for before, after in pairwise(steps):
+        if before.target_stamp_ns != after.source_stamp_ns:
+            raise ValueError(f"no step from {before.target_stamp_ns} to {after.source_stamp_ns} ns")
+    motions = motions_of(steps)
+    poses = list(accumulate(motions.as_matrix(), np.matmul, initial=np.eye(4)))
+    covariances = [np.zeros((6, 6))]
+    for backward, step in zip(adjoint(motions.inv()), steps, strict=True):
+        covariances.append(backward @ covariances[-1] @ backward.T + step.covariance)
+    return Trajectory(stamps_of(steps), RigidTransform.from_matrix(np.stack(poses)), np.stack(covariances))
+
+
+def motions_of(steps: Sequence[PairEstimate]) -> RigidTransform:
+    """The motions T_source_target of N > 0 steps."""
+    rotations = Rotation.from_quat(np.stack([step.quat_wxyz for step in steps]), scalar_first=True)
+    return RigidTransform.from_components(np.stack([step.translation for step in steps]), rotations)
+
+
+def stamps_of(steps: Sequence[PairEstimate]) -> IntArray:
+    """The N + 1 stamps that N steps lead through."""
+    return np.array([steps[0].source_stamp_ns, *(step.target_stamp_ns for step in steps)], dtype=np.int64)
+
+
+def bridge_gaps(
+    frame_stamps: IntArray, pairs: Sequence[PairEstimate], inertial: ImuSeries | None
+) -> tuple[list[PairEstimate], int]:
+    """The steps through all stamps of frames (N,) and pairs, and the number of holes between pairs that were bridged.
+
+    Recorded pairs that follow each other become steps as they are; pairs that skip what others lead through are left
+    out. A frame inside the span of a pair splits its motion evenly. A hole is crossed with the velocity of the pairs
+    at its sides (interpolated between them, constant where there is but one), and with the rotation of the gyro where
+    `inertial` (in the camera's axes and time) measured it; its covariance grows with the time since it began.
+
+    Raises LogError where there is no pair at all.
+    """
+    recorded = _following_each_other(pairs)
+    if not recorded:
+        raise LogError("no pair estimates: nothing to make a trajectory of")
+    ends = [stamp for pair in recorded for stamp in (pair.source_stamp_ns, pair.target_stamp_ns)]
+    stamps = np.union1d(frame_stamps, ends)
+    gyro = _Gyro(inertial, recorded)
+    steps: list[PairEstimate] = []
+    holes = 0
+    for before, after in pairwise([None, *recorded, None]):
+        hole = _between(
+            stamps,
+            before.target_stamp_ns if before else int(stamps[0]),
+            after.source_stamp_ns if after else int(stamps[-1]),
+        )
+        if len(hole) > 1:
+            holes += 1
+            steps.extend(_bridge(hole, before, after, gyro))
+        if after:
+            steps.extend(_split(after, _between(stamps, after.source_stamp_ns, after.target_stamp_ns)))
+    return steps, holes
+
+
+def _following_each_other(pairs: Sequence[PairEstimate]) -> list[PairEstimate]:
+    """The longest list of pairs of which none overlaps another (earliest end first; of equal ends the shortest)."""
+    chosen: list[PairEstimate] = []
+    for pair in sorted(pairs, key=lambda pair: (pair.target_stamp_ns, -pair.source_stamp_ns)):
+        if not chosen or pair.source_stamp_ns >= chosen[-1].target_stamp_ns:
+            chosen.append(pair)
+    return chosen
+
+
+def _between(stamps: IntArray, start_ns: int, end_ns: int) -> IntArray:
+    """The sorted stamps from start to end, both included."""
+    return stamps[np.searchsorted(stamps, start_ns) : np.searchsorted(stamps, end_ns, side="right")]
+
+
+def _split(pair: PairEstimate, stamps: IntArray) -> list[PairEstimate]:
+    """A pair as steps through the stamps (N,) it spans: constant twist, pieces that compound to its covariance."""
+    if len(stamps) == 2:
+        return [pair]
+    twist = pair.T_source_target.as_exp_coords()
+    share = (stamps - stamps[0]) / (stamps[-1] - stamps[0])
+    to_end = adjoint(RigidTransform.from_exp_coords(np.outer(1.0 - share[1:], twist)))
+    covariances = np.diff(share)[:, None, None] * (to_end @ pair.covariance @ to_end.swapaxes(-1, -2))
+    return [
+        _step(start, end, RigidTransform.from_exp_coords(part * twist), covariance)
+        for (start, end), part, covariance in zip(pairwise(stamps), np.diff(share), covariances, strict=True)
+    ]
+
+
+def _bridge(
+    stamps: IntArray, before: PairEstimate | None, after: PairEstimate | None, gyro: _Gyro
+) -> Iterator[PairEstimate]:
+    """Steps through the stamps (N,) of a hole between two pairs, of which one may be missing.
+
+    The covariance of a step is what the hole's covariance grows by during it, so that the sum over the hole is that
+    of one unknown constant acceleration (variance t^4 / 4) and of the neighbours' uncertain rate (variance t^2).
+    """
+    sides = [pair for pair in (before, after) if pair]
+    rates = np.stack([pair.T_source_target.as_exp_coords() / pair.duration_s for pair in sides])
+    rate_covariance = np.mean([pair.covariance / pair.duration_s**2 for pair in sides], axis=0)
+    acceleration_covariance = np.diag(3 * [UNKNOWN_ANGULAR_ACCELERATION**2] + 3 * [UNKNOWN_ACCELERATION**2])
+    seconds = (stamps - stamps[0]) / NANOSECONDS
+    for k, (start, end) in enumerate(pairwise(stamps)):
+        t0, t1 = seconds[k : k + 2]
+        share = (t0 + t1) / 2 / seconds[-1]
+        twist = (t1 - t0) * (rates[0] * (1.0 - share) + rates[-1] * share)
+        covariance = rate_covariance * (t1**2 - t0**2) + acceleration_covariance * (t1**4 - t0**4) / 4
+        rotation = gyro.rotation(start, end)
+        if rotation is not None:
+            twist[:3] = rotation.as_rotvec()
+            covariance[:3], covariance[:, :3] = 0.0, 0.0
+            covariance[:3, :3] = UNKNOWN_GYRO_RATE**2 * (t1**2 - t0**2) * np.eye(3)
+        yield _step(start, end, RigidTransform.from_exp_coords(twist), covariance)
+
+
+class _Gyro:
+    """Rotations measured by the gyro, its bias taken as the median difference to the rates of the recorded pairs."""
+
+    def __init__(self, inertial: ImuSeries | None, pairs: Sequence[PairEstimate]) -> None:
+        self._windows = ImuWindows(inertial) if inertial is not None else None
+        self._bias = np.zeros(3)
+        excess = [
+            (measured.as_rotvec() - pair.T_source_target.rotation.as_rotvec()) / pair.duration_s
+            for pair in pairs
+            if (measured := self.rotation(pair.source_stamp_ns, pair.target_stamp_ns)) is not None
+        ]
+        if excess:
+            self._bias = np.median(excess, axis=0)
+
+    def rotation(self, start_ns: int, end_ns: int) -> Rotation | None:
+        """The rotation R_start_end, or None where the gyro did not measure all of it."""
+        window = self._windows.over(start_ns, end_ns) if self._windows else None
+        if window is None:
+            return None
+        durations, rates, _ = window
+        increments = Rotation.from_rotvec((rates - self._bias) * durations[:, None])
+        return reduce(mul, increments)
+
+
+def _step(start_ns: int, end_ns: int, motion: RigidTransform, covariance: FloatArray) -> PairEstimate:
+    """A step that no front end has seen."""
+    quat_wxyz = motion.rotation.as_quat(scalar_first=True)
+    return PairEstimate(int(start_ns), int(end_ns), quat_wxyz, motion.translation, covariance)

@@ -1,0 +1,259 @@
+"""The main job: a log in, absolute trajectories out. ``python -m fusion.run --log seq09.mcap``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter, strftime
+from typing import TYPE_CHECKING, Any
+
+from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+    from fusion.config import FrontendConfig, ImuConfig, RunConfig
+    from fusion.output import Findings, Outcome
+    from fusion_io.reader import Log
+    from fusion_io.records import ImuSeries, PairEstimate, Trajectory
+
+# Modules that bring numpy, torch or GTSAM are imported by the function that needs them, so that --help answers at once.
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = _parser().parse_args(argv)
+    try:
+        from fusion import config
+
+        return run(arguments.log, arguments.out, config.load(arguments.config, _overrides(arguments)))
+    except FusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+
+
+def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
+    """Compute all about one log, write it to a folder, print the table; returns the exit code.
+
+    Raises UsageError for a folder that cannot be used, and LogError for a log without anything to compute from.
+    """
+    stopwatch = Stopwatch()
+    from fusion import chain, imu, output
+    from fusion.evaluation import evaluate
+    from fusion_io.reader import open_log
+
+    log = open_log(log_path, config.topics.model_dump(exclude_none=True))
+    folder = output.prepare_folder(out or default_folder(log_path), log_path)
+    samples, ground_truth = log.imu(), log.ground_truth()
+    findings = output.Findings()
+    stopwatch.lap("read")
+
+    pairs = pair_estimates(log, samples, config.frontend, findings)
+    stopwatch.lap("pairs")
+
+    calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
+    inertial = imu.in_camera_axes(samples, calibration) if calibration.used else None
+    stopwatch.lap("calibration")
+
+    steps, gaps = chain.bridge_gaps(log.frame_stamps(), pairs, inertial)
+    findings.add("gaps_bridged", gaps, "gaps between pair estimates were bridged")
+    trajectories = {"raw": chain.chain(steps)}
+    stopwatch.lap("raw")
+
+    for name in back_ends(config):
+        trajectories |= fuse(name, steps, inertial, config, findings)
+        stopwatch.lap(name)
+
+    metrics = {name: evaluate(each, ground_truth, config.segment_lengths_m) for name, each in trajectories.items()}
+    stopwatch.lap("evaluation")
+
+    outcome = output.Outcome(log, config, samples, pairs, ground_truth, calibration, trajectories, metrics, findings)
+    output.write_log(folder, outcome)
+    output.write_text(folder, outcome)
+    stopwatch.lap("writing")
+    output.write_plots(folder, outcome)
+    stopwatch.lap("plots")
+    output.write_metrics(folder, outcome, stopwatch.seconds)
+
+    report(folder, outcome)
+    return exit_code(outcome)
+
+
+def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: Findings) -> list[PairEstimate]:
+    """The recorded pair estimates of the log or those of the network, as they read back from their message.
+
+    Passing the network's estimates through their message makes a replay of the output start from the same bits.
+    Raises LogError where there are none.
+    """
+    if config.mode == "recorded" or (config.mode == "auto" and log.has_pairs):
+        pairs = log.pairs()
+        if not pairs:
+            raise LogError(f"{log.path}: no recorded pair estimates, and the front end is to use those")
+        return pairs
+    if not log.has_frames:
+        raise LogError(f"{log.path}: neither pair estimates nor images with depth; it has {', '.join(log.roles)}")
+    from fusion_io.messages import decode_pair, encode_pair
+    from fusion_io.progress import track
+    from learned.estimator import estimate_pairs
+
+    skipped: Counter[str] = Counter()
+    frames = track(log.frames(), "pair estimates", len(log.frame_stamps()))
+    estimates = estimate_pairs(log, imu, config.weights, frames, skipped)
+    pairs = [decode_pair(encode_pair(pair)) for pair in estimates]
+    for name, count in skipped.items():
+        findings.add(name, count, name.replace("_", " "))
+    if not pairs:
+        raise LogError(f"{log.path}: no pair of frames could be estimated, of {len(log.frame_stamps())} frames")
+    return pairs
+
+
+def known_mounting(log: Log, config: ImuConfig) -> Rotation | None:
+    """The rotation from camera to IMU axes if the configuration or else the log gives it."""
+    from scipy.spatial.transform import Rotation
+
+    if config.rotation_imu_camera_quat_wxyz is not None:
+        return Rotation.from_quat(config.rotation_imu_camera_quat_wxyz, scalar_first=True)
+    return log.mounting()
+
+
+def back_ends(config: RunConfig) -> Sequence[str]:
+    """The names of the back ends that are asked for."""
+    return ("posegraph", "ekf") if config.backend == "both" else (config.backend,)
+
+
+def fuse(
+    name: str, steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: RunConfig, findings: Findings
+) -> dict[str, Trajectory]:
+    """The trajectory of a back end by its name; empty, and counted, where it fails: the other results shall come out."""
+    from numpy.linalg import LinAlgError
+
+    from fusion import ekf, posegraph
+
+    try:
+        if name == "posegraph":
+            return {name: posegraph.solve(steps, inertial, config.posegraph)}
+        filtered = ekf.solve(steps, inertial, config.ekf)
+        findings.add("ekf_rejected", filtered.rejected, "pair estimates were rejected by the EKF's gate")
+        return {name: filtered.trajectory}
+    except (FusionError, LinAlgError, RuntimeError) as error:  # GTSAM's solvers raise RuntimeError
+        findings.add(f"{name}_failed", 1, f"back end {name} failed: {' '.join(str(error).split())}")
+        return {}
+
+
+def report(folder: Path, outcome: Outcome) -> None:
+    """Print the table, the verdict on the IMU and where the results are to stdout, and the warnings to stderr."""
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from fusion.table import print_table
+
+    log, calibration = outcome.log, outcome.calibration
+    for note in (*log.notes, *outcome.findings.notes):
+        print(f"warning: {note}", file=sys.stderr)
+    title = f"{log.path.name}: {len(outcome.trajectories['raw'])} frames, {outcome.duration_s:.1f} s"
+    metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
+    print_table(Console(), title, outcome.trajectories, metrics)
+    print(f"IMU {'used' if calibration.used else 'left out'}: {calibration.reason}")
+    print(f"Results: {folder}")
+
+
+def exit_code(outcome: Outcome) -> int:
+    """1 where a back end that was asked for has nothing to show, 3 for a damaged log, else 0."""
+    if any(name not in outcome.trajectories for name in back_ends(outcome.config)):
+        return EXIT_FAILED
+    return EXIT_DAMAGED if outcome.log.damaged else EXIT_OK
+
+
+def default_folder(log_path: Path) -> Path:
+    """runs/<log name>-<time>."""
+    return Path("runs", f"{log_path.stem}-{strftime('%Y%m%d-%H%M%S')}")
+
+
+class Stopwatch:
+    """Seconds by stage: each lap ends the stage that began with the lap before."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """End a stage."""
+        now = perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m fusion.run",
+        description="Compute absolute camera trajectories, raw and fused, from an RGB-D and IMU log.",
+        epilog="Exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a damaged log.",
+    )
+    parser.add_argument("--log", type=Path, required=True, metavar="FILE.mcap", help="the log to compute from")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: runs/<log name>-<time>)")
+    parser.add_argument("--backend", choices=("posegraph", "ekf", "both"), help="what fuses (default: both)")
+    parser.add_argument(
+        "--frontend",
+        choices=("auto", "violearner", "recorded"),
+        help="where pair estimates come from (default: auto, those in the log if it has any, else the network)",
+    )
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="the network's weights (default: those shipped)")
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; the options here come before it")
+    parser.add_argument(
+        "--segment-lengths",
+        type=_lengths,
+        metavar="M,M,...",
+        help="path lengths of t_rel and r_rel in metres (default: KITTI's 100,200,...,800)",
+    )
+    parser.add_argument(
+        "--record",
+        choices=("light", "all"),
+        help="what goes into run.mcap: all with the images, light without (default: light)",
+    )
+    parser.add_argument(
+        "--topic",
+        type=_role_and_topic,
+        action="append",
+        metavar="ROLE=NAME",
+        help="the topic of a role where the log leaves it open; roles: image, depth, camera_info, imu, gyro, "
+        "accelerometer, ground_truth, pairs, gnss; may be repeated",
+    )
+    return parser
+
+
+def _lengths(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of lengths such as 10,20,30") from None
+
+
+def _role_and_topic(text: str) -> tuple[str, str]:
+    role, equals, topic = text.partition("=")
+    if not (role and equals and topic):
+        raise argparse.ArgumentTypeError(f"{text!r} is not ROLE=NAME such as imu=/imu/data")
+    return role, topic
+
+
+def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says, in the shape of the configuration; what it leaves open is absent."""
+    options = {
+        "backend": arguments.backend,
+        "record": arguments.record,
+        "segment_lengths_m": arguments.segment_lengths,
+        "topics": dict(arguments.topic) if arguments.topic else None,
+    }
+    frontend = {"mode": arguments.frontend, "weights": arguments.weights}
+    return _given(options) | {"frontend": _given(frontend)}
+
+
+def _given(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""The table a run prints: raw against fused, one row a measure, readable on 80 columns and in a pipe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from fusion_io.records import Trajectory
+
+Metrics = Mapping[str, float | int | None]
+
+HEADINGS = {"raw": "raw", "posegraph": "pose graph", "ekf": "EKF"}
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One measure: its key in metrics.json, how it is shown, and the value that would be right."""
+
+    key: str
+    label: str
+    unit: str
+    decimals: int
+    scale: float = 1.0
+    right: float = 0.0
+
+
+ROWS = (
+    _Row("t_rel_percent", "t_rel", "%", 3),
+    _Row("r_rel_deg_per_100m", "r_rel", "deg/100 m", 3),
+    _Row("ate_m", "ATE, aligned", "m", 3),
+    _Row("end_error_m", "end-point error", "m", 3),
+    _Row("rpe_translation_m", "RPE a pair, translation", "m", 4),
+    _Row("rpe_rotation_rad", "RPE a pair, rotation", "mrad", 3, scale=1e3),
+    _Row("anees_position", "ANEES, position", "3 is right", 2, right=3.0),
+    _Row("anees_orientation", "ANEES, orientation", "3 is right", 2, right=3.0),
+)
+
+
+def print_table(
+    console: Console, title: str, trajectories: Mapping[str, Trajectory], metrics: Mapping[str, Metrics]
+) -> None:
+    """Print all trajectories side by side; measures that nothing could be said about are left out."""
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("")
+    table.add_column("")
+    for name in trajectories:
+        table.add_column(HEADINGS[name], justify="right", no_wrap=True)
+    for row in ROWS:
+        values = [metrics[name][row.key] for name in trajectories]
+        if any(value is not None for value in values):
+            table.add_row(row.label, Text(row.unit), *_cells(row, values))
+    table.add_section()
+    table.add_row("path length", "m", *(_number(_path_length(each), 1) for each in trajectories.values()))
+    table.add_row("stated 1-sigma at the end", "m", *(_final_sigma(each) for each in trajectories.values()))
+    console.print(Text(title))
+    console.print(table)
+    console.print(Text(_legend(metrics)))
+
+
+def _cells(row: _Row, values: Sequence[float | int | None]) -> list[Text]:
+    """The values of a row, the best one in bold (seen on a terminal only)."""
+    best = min(abs(value - row.right) for value in values if value is not None)
+    return [
+        Text("-")
+        if value is None
+        else Text(_number(value * row.scale, row.decimals), style="bold" if abs(value - row.right) == best else "")
+        for value in values
+    ]
+
+
+def _number(value: float, decimals: int) -> str:
+    """A number of at most nine characters, so that even a diverged result leaves the table in shape."""
+    return f"{value:.{decimals}f}" if abs(value) < 1e4 else f"{value:.2e}"
+
+
+def _legend(metrics: Mapping[str, Metrics]) -> str:
+    if all(value is None for values in metrics.values() for value in values.values()):
+        return "No ground truth in the log, so no errors can be given."
+    if all(values["t_rel_percent"] is None for values in metrics.values()):
+        return "Lower is better. No t_rel: the path is shorter than the shortest of --segment-lengths."
+    return "Lower is better; an ANEES above 3 is overconfident."
+
+
+def _path_length(trajectory: Trajectory) -> float:
+    steps = np.diff(trajectory.poses.translation, axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
+
+
+def _final_sigma(trajectory: Trajectory) -> str:
+    """Root of the summed variances of the last position, as the back end states it."""
+    if trajectory.covariances is None:
+        return "-"
+    return _number(float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:]))), 2)

@@ -1,0 +1,381 @@
+"""KITTI's recordings: the odometry benchmark and the raw drives.
+
+Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012;
+Geiger, Lenz, Stiller, Urtasun, "Vision meets robotics: the KITTI dataset", IJRR 2013; the development
+kits' ``readme.txt`` and ``dataformat.txt``.
+
+Frame i of a recording is line i of its time stamps; an image that is not on disk is no error. Camera 0 is
+the left grey camera, 1 the right one; 2 and 3 are the colour cameras. Both pairs are rectified.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion_io.errors import LogError, UsageError
+from fusion_io.images import SUFFIXES, Framing
+from fusion_io.recording import Recording, between, is_later
+from fusion_io.records import NANOSECONDS, FloatArray, GnssFix, ImuSeries, IntArray, Trajectory
+from fusion_io.stereo import StereoPair, StereoRig, stereo_frames
+from fusion_io.trajectory_files import read_kitti, read_rows, read_text, read_times
+
+#: IMU rows from one frame to the next in the odometry benchmark's IMU files.
+IMU_ROWS_PER_FRAME = 10
+IMU_VARIABLE = "imu_data_interp"
+
+#: IMU samples are kept this long before the first and after the last frame: a window before the first
+#: pair, and room for an offset between the clocks.
+IMU_MARGIN_NS = NANOSECONDS // 2
+
+GREY_CAMERAS = (0, 1)
+COLOUR_CAMERAS = (2, 3)
+
+#: Columns of an OXTS record that are used here (``dataformat.txt``), of 30.
+OXTS_COLUMNS = 30
+_LATITUDE, _LONGITUDE, _ALTITUDE = 0, 1, 2
+_ROLL_PITCH_YAW = slice(3, 6)
+_ACCELERATION = slice(11, 14)  # ax ay az in the unit's axes; af al au are levelled
+_ANGULAR_RATE = slice(17, 20)  # wx wy wz in the unit's axes
+_POSITION_ACCURACY = 23
+#: The earth's radius of the development kit's Mercator projection (WGS84's equator), in metres.
+EARTH_RADIUS_M = 6378137.0
+
+
+# ---------------------------------------------------------------------------------------------- the odometry
+
+
+def open_odometry(
+    root: Path,
+    sequence: str,
+    *,
+    imu: Path | None = None,
+    frames: slice = slice(None),
+    colour: bool = False,
+    framing: Framing = Framing(),
+) -> Recording:
+    """A sequence of the odometry benchmark in its official layout.
+
+    root: the folder of ``sequences/`` and (optional) ``poses/``. imu: the sequence's IMU file. frames: the
+    range of frames to take. colour: cameras 2 and 3 instead of 0 and 1. Ground truth, where there is one,
+    is that of the chosen left camera, in the frame of the first pose of the range.
+    """
+    folder = root / "sequences" / sequence
+    if not folder.is_dir():
+        raise LogError(f"{folder}: no such sequence")
+    times = folder / "times.txt"
+    stamps_ns = read_times(times)
+    calibration = folder / "calib.txt"
+    matrices = read_calibration(calibration)
+    cameras = _chosen_cameras(folder, "image_{}", colour)
+    rig, P_left = _rig(calibration, matrices, [f"P{camera}" for camera in cameras])
+    files = [_numbered_images(folder / f"image_{camera}") for camera in cameras]
+
+    recording = Recording()
+    pairs = _stereo_pairs(stamps_ns, files, _indices(stamps_ns, frames, times), folder, recording.warnings)
+    recording.frames = stereo_frames(rig, pairs, framing, recording.warnings)
+    recording.frame_count = len(pairs)
+    first_ns, last_ns = pairs[0].stamp_ns, pairs[-1].stamp_ns
+    if imu is not None:
+        recording.imu = between(read_imu_mat(imu, stamps_ns), first_ns - IMU_MARGIN_NS, last_ns + IMU_MARGIN_NS)
+    poses = root / "poses" / f"{sequence}.txt"
+    if poses.is_file():
+        truth = _of_camera(read_kitti(poses, stamps_ns), _translation(rig, P_left))
+        recording.ground_truth = _between(truth, first_ns, last_ns).relative_to_first()
+    return recording
+
+
+def read_imu_mat(path: Path, frame_stamps_ns: IntArray) -> ImuSeries:
+    """The IMU of an odometry sequence, in the OXTS unit's frame (x forward, y left, z up).
+
+    The file holds (10 (n - 1) + 1, 6) numbers for the n frames of the whole sequence: ax ay az (m/s^2,
+    gravity included), wx wy wz (rad/s). Row 10 k was measured at frame k; the nine rows that follow divide
+    the interval to the next frame, which is about 104 ms and not constant.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        table = loadmat(path, variable_names=[IMU_VARIABLE]).get(IMU_VARIABLE)
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}") from None
+    except (MatReadError, ValueError, TypeError, NotImplementedError) as error:
+        raise LogError(f"{path}: not a MATLAB file that can be read ({error})") from None
+    if table is None:
+        raise LogError(f"{path}: holds no variable {IMU_VARIABLE}")
+    shape = (IMU_ROWS_PER_FRAME * (len(frame_stamps_ns) - 1) + 1, 6)
+    if table.shape != shape or not np.issubdtype(table.dtype, np.floating):
+        raise LogError(f"{path}: {IMU_VARIABLE} is {table.dtype} {table.shape} where {shape} real numbers are expected")
+    if not np.isfinite(table).all():
+        raise LogError(f"{path}: {IMU_VARIABLE} holds numbers that are not finite")
+    return ImuSeries(
+        _divided(frame_stamps_ns, IMU_ROWS_PER_FRAME),
+        angular_velocity=np.ascontiguousarray(table[:, 3:], dtype=np.float64),
+        linear_acceleration=np.ascontiguousarray(table[:, :3], dtype=np.float64),
+    )
+
+
+def _divided(stamps_ns: IntArray, parts: int) -> IntArray:
+    """The stamps with each interval divided into equal parts, rounded down to nanoseconds."""
+    steps = np.diff(stamps_ns)[:, None] * np.arange(parts) // parts
+    return np.append((stamps_ns[:-1, None] + steps).ravel(), stamps_ns[-1])
+
+
+# --------------------------------------------------------------------------------------------- the raw drives
+
+
+def open_raw(
+    drive: Path,
+    calibration: Path | None = None,
+    *,
+    frames: slice = slice(None),
+    colour: bool = False,
+    gnss: bool = False,
+    framing: Framing = Framing(),
+) -> Recording:
+    """A raw drive (``..._sync``), with its OXTS unit as IMU and as ground truth.
+
+    calibration: the folder of the day's ``calib_*.txt``, the drive's parent if not given. gnss: also take
+    the unit's positions as GNSS fixes. Ground truth keeps the stamps of the OXTS records, and is that of
+    the chosen left camera in the frame of its first pose.
+    """
+    calibration = drive.resolve().parent if calibration is None else calibration
+    if not drive.is_dir():
+        raise LogError(f"{drive}: no such drive")
+    cameras = _chosen_cameras(drive, "image_{:02d}", colour)
+    left, right = (drive / f"image_{camera:02d}" for camera in cameras)
+    times = left / "timestamps.txt"
+    stamps_ns = read_timestamps(times)
+    if not is_later(stamps_ns).all():
+        raise LogError(f"{times}: the times do not increase")
+    cam_to_cam = calibration / "calib_cam_to_cam.txt"
+    matrices = read_calibration(cam_to_cam)
+    rig, P_left = _rig(cam_to_cam, matrices, [f"P_rect_{camera:02d}" for camera in cameras])
+    T_camera_imu = _translation(rig, P_left) * _camera0_from_imu(calibration, matrices)
+
+    recording = Recording(rotation_imu_camera=T_camera_imu.rotation.inv())
+    files = [_numbered_images(folder / "data") for folder in (left, right)]
+    pairs = _stereo_pairs(stamps_ns, files, _indices(stamps_ns, frames, times), left, recording.warnings)
+    width, height = _matrix(cam_to_cam, matrices, f"S_rect_{cameras[0]:02d}", (2,)).astype(int).tolist()
+    recording.frames = stereo_frames(rig, pairs, framing, recording.warnings, (width, height))
+    recording.frame_count = len(pairs)
+
+    oxts = _read_oxts(drive / "oxts", recording.warnings)
+    oxts = oxts.between(pairs[0].stamp_ns - IMU_MARGIN_NS, pairs[-1].stamp_ns + IMU_MARGIN_NS)
+    if not len(oxts.stamps_ns):
+        raise LogError(f"{drive}: the images and the OXTS records do not overlap in time")
+    recording.imu = oxts.imu()
+    recording.ground_truth = _of_camera(oxts.trajectory(), T_camera_imu).relative_to_first()
+    recording.gnss = oxts.gnss() if gnss else []
+    return recording
+
+
+_TIMESTAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
+
+
+def read_timestamps(path: Path) -> IntArray:
+    """A raw drive's ``timestamps.txt``: date and time with nine decimals a line, as nanoseconds since 1970.
+
+    The times are taken as UTC. They need not increase.
+    """
+    lines = [line.strip() for line in read_text(path).rstrip().splitlines()]
+    if not lines:
+        raise LogError(f"{path}: holds no data")
+    for number, line in enumerate(lines, start=1):
+        if not _TIMESTAMP.fullmatch(line):
+            raise LogError(f"{path}: line {number}: not a date and time ({line[:40]!r})")
+    try:
+        return np.array(lines, dtype="datetime64[ns]").astype(np.int64)
+    except ValueError as error:
+        raise LogError(f"{path}: {error}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Oxts:
+    """Records of the OXTS unit: stamps_ns (N,) strictly increasing, values (N, 30)."""
+
+    stamps_ns: IntArray
+    values: FloatArray
+
+    def between(self, start_ns: int, end_ns: int) -> Oxts:
+        """The records from start to end, both included."""
+        chosen = slice(*np.searchsorted(self.stamps_ns, [start_ns, end_ns + 1]))
+        return Oxts(self.stamps_ns[chosen], self.values[chosen])
+
+    def imu(self) -> ImuSeries:
+        """Rates and accelerations in the unit's own axes (x forward, y left, z up)."""
+        return ImuSeries(self.stamps_ns, self.values[:, _ANGULAR_RATE], self.values[:, _ACCELERATION])
+
+    def trajectory(self) -> Trajectory:
+        """Poses of the unit in an east-north-up world, by the development kit's rule.
+
+        Mercator projection with the scale of the first latitude, and R = Rz(yaw) Ry(pitch) Rx(roll), as in
+        ``convertOxtsToPose.m``.
+        """
+        latitude, longitude = np.radians(self.values[:, _LATITUDE]), np.radians(self.values[:, _LONGITUDE])
+        radius = np.cos(latitude[0]) * EARTH_RADIUS_M
+        north = radius * np.log(np.tan(np.pi / 4 + latitude / 2))
+        position = np.column_stack([radius * longitude, north, self.values[:, _ALTITUDE]])
+        # Metres near the origin keep their digits through all that follows.
+        position -= position[0]
+        rotation = Rotation.from_euler("xyz", self.values[:, _ROLL_PITCH_YAW])
+        return Trajectory(self.stamps_ns, RigidTransform.from_components(position, rotation))
+
+    def gnss(self) -> list[GnssFix]:
+        """Positions with the unit's own estimate of their accuracy, taken as equal in all directions."""
+        positions = self.values[:, [_LATITUDE, _LONGITUDE, _ALTITUDE]].tolist()
+        accuracies = self.values[:, _POSITION_ACCURACY]
+        return [
+            GnssFix(stamp_ns, *position, covariance=accuracy**2 * np.eye(3))
+            for stamp_ns, position, accuracy in zip(self.stamps_ns.tolist(), positions, accuracies, strict=True)
+        ]
+
+
+def _read_oxts(folder: Path, warnings: Counter[str]) -> Oxts:
+    stamps_ns = read_timestamps(folder / "timestamps.txt")
+    data = folder / "data"
+    files = [data / f"{index:010d}.txt" for index in range(len(stamps_ns))]
+    on_disk = [index for index, file in enumerate(files) if file.is_file()]
+    _count(warnings, "OXTS records missing", len(files) - len(on_disk))
+    if not on_disk:
+        raise LogError(f"{data}: holds no OXTS record")
+    stamps_ns = stamps_ns[on_disk]
+    values = np.array([_read_oxts_record(files[index]) for index in on_disk])
+    later = is_later(stamps_ns)
+    _count(warnings, "OXTS records dropped because their time does not increase", int((~later).sum()))
+    return Oxts(stamps_ns[later], values[later])
+
+
+def _read_oxts_record(path: Path) -> list[float]:
+    row = read_rows(path, columns=(OXTS_COLUMNS,))[0]
+    values = row.finite()
+    if not (abs(values[_LATITUDE]) < 90 and abs(values[_LONGITUDE]) <= 360):
+        raise row.error(f"not a position ({values[_LATITUDE]}, {values[_LONGITUDE]})")
+    return values
+
+
+def _camera0_from_imu(folder: Path, cam_to_cam: Mapping[str, FloatArray]) -> RigidTransform:
+    """T_camera_imu of the rectified camera 0: rectification, then Velodyne to camera, then IMU to Velodyne."""
+    rectification = _rotation(folder / "calib_cam_to_cam.txt", cam_to_cam, "R_rect_00")
+    T_camera_imu = RigidTransform.from_rotation(rectification)
+    for name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"):
+        path = folder / name
+        matrices = read_calibration(path)
+        translation = _matrix(path, matrices, "T", (3,))
+        T_camera_imu *= RigidTransform.from_components(translation, _rotation(path, matrices, "R"))
+    return T_camera_imu
+
+
+# ------------------------------------------------------------------------------------------------ calibration
+
+
+def read_calibration(path: Path) -> dict[str, FloatArray]:
+    """A calibration file: lines of ``name: numbers``. Lines of another kind (``calib_time``) are left out."""
+    matrices = {}
+    for line in read_text(path).splitlines():
+        name, _, words = line.partition(":")
+        try:
+            matrices[name.strip()] = np.array([float(word) for word in words.split()])
+        except ValueError:
+            continue
+    return matrices
+
+
+def _matrix(path: Path, matrices: Mapping[str, FloatArray], name: str, shape: tuple[int, ...]) -> FloatArray:
+    values = matrices.get(name)
+    if values is None:
+        raise LogError(f"{path}: no {name}")
+    if values.size != np.prod(shape) or not np.isfinite(values).all():
+        raise LogError(f"{path}: {name} must be {np.prod(shape)} finite numbers")
+    return values.reshape(shape)
+
+
+def _rotation(path: Path, matrices: Mapping[str, FloatArray], name: str) -> Rotation:
+    matrix = _matrix(path, matrices, name, (3, 3))
+    if np.linalg.det(matrix) <= 0 or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+        raise LogError(f"{path}: {name} is not a rotation")
+    return Rotation.from_matrix(matrix)
+
+
+def _rig(path: Path, matrices: Mapping[str, FloatArray], names: Sequence[str]) -> tuple[StereoRig, FloatArray]:
+    """The stereo pair of two projection matrices, and that of its left camera."""
+    P_left, P_right = (_matrix(path, matrices, name, (3, 4)) for name in names)
+    try:
+        return StereoRig.from_projections(P_left, P_right), P_left
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from None
+
+
+def _translation(rig: StereoRig, P_left: FloatArray) -> RigidTransform:
+    """T_left_camera0: where camera 0 is, seen from the left camera of the pair; P = K [I | t]."""
+    return RigidTransform.from_translation(np.linalg.solve(rig.K, P_left[:, 3]))
+
+
+# ----------------------------------------------------------------------------------------------------- frames
+
+
+def _chosen_cameras(folder: Path, pattern: str, colour: bool) -> tuple[int, int]:
+    """The left and right camera: grey if it is there and colour is not asked for."""
+    wanted = [COLOUR_CAMERAS] if colour else [GREY_CAMERAS, COLOUR_CAMERAS]
+    for cameras in wanted:
+        if (folder / pattern.format(cameras[0])).is_dir():
+            return cameras
+    names = " or ".join(pattern.format(cameras[0]) for cameras in wanted)
+    raise LogError(f"{folder}: no folder {names}")
+
+
+def _numbered_images(folder: Path) -> dict[int, Path]:
+    """The images of a folder by the number that is their name; none where there is no folder."""
+    if not folder.is_dir():
+        return {}
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.stem.isdecimal())
+    return {int(file.stem): file for file in files}
+
+
+def _indices(stamps_ns: IntArray, frames: slice, times: Path) -> range:
+    indices = range(len(stamps_ns))[frames]
+    if not indices:
+        raise UsageError(f"no frame in the range asked for: {times} has {len(stamps_ns)}")
+    return indices
+
+
+def _stereo_pairs(
+    stamps_ns: IntArray,
+    files: Sequence[Mapping[int, Path]],
+    indices: range,
+    folder: Path,
+    warnings: Counter[str],
+) -> list[StereoPair]:
+    """The frames whose left image is on disk."""
+    left, right = files
+    pairs = [StereoPair(int(stamps_ns[index]), left[index], right.get(index)) for index in indices if index in left]
+    if not pairs:
+        raise LogError(f"{folder}: holds no image of frames {indices.start} to {indices.stop - 1}")
+    _count(warnings, "frames missing (no left image)", len(indices) - len(pairs))
+    _count(warnings, "frames without depth (no right image)", sum(pair.right is None for pair in pairs))
+    _count(warnings, "images without a time stamp", sum(index >= len(stamps_ns) for index in left))
+    return pairs
+
+
+def _count(warnings: Counter[str], what: str, times: int) -> None:
+    if times:
+        warnings[what] += times
+
+
+# ------------------------------------------------------------------------------------------------ trajectories
+
+
+def _of_camera(trajectory: Trajectory, T_camera_body: RigidTransform) -> Trajectory:
+    """The trajectory of a camera from that of the body it is mounted on."""
+    return Trajectory(trajectory.stamps_ns, trajectory.poses * T_camera_body.inv())
+
+
+def _between(trajectory: Trajectory, start_ns: int, end_ns: int) -> Trajectory:
+    chosen = slice(*np.searchsorted(trajectory.stamps_ns, [start_ns, end_ns + 1]))
+    return Trajectory(trajectory.stamps_ns[chosen], trajectory.poses[chosen])

@@ -1,0 +1,170 @@
+"""Depth from a rectified stereo pair, by semi-global matching.
+
+Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008, as OpenCV
+implements it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_io.errors import LogError
+from fusion_io.images import Framing, read_image
+from fusion_io.records import CameraFrame, CameraInfo, FloatArray
+
+#: Nearer than this nothing is matched: twice the range costs twice the time. KITTI's road begins 6 m ahead.
+NEAREST_M = 3.2
+#: A depth is refused where the match back from the right image lands further away than this (pixels).
+LEFT_RIGHT_TOLERANCE = 1
+
+_MODE = cv2.StereoSGBM_MODE_SGBM
+_BLOCK = 5
+_UNIQUENESS_PERCENT = 5
+_SPECKLE_PIXELS = 100
+_SPECKLE_RANGE = 2
+#: OpenCV's disparities are integers in units of 1/16 pixel, and their number is a multiple of 16.
+_UNIT = 16
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRig:
+    """A rectified pair of cameras with the same K (3, 3), the right one ``baseline_m`` along x."""
+
+    K: FloatArray
+    baseline_m: float
+
+    @classmethod
+    def from_projections(cls, P_left: FloatArray, P_right: FloatArray) -> StereoRig:
+        """From the (3, 4) projection matrices, in pixels, of two rectified cameras."""
+        K = P_left[:, :3]
+        if not (K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K, P_right[:, :3])):
+            raise LogError("the projection matrices are not those of a rectified stereo pair")
+        baseline_m = (P_left[0, 3] - P_right[0, 3]) / K[0, 0]
+        if not baseline_m > 0:
+            raise LogError(f"the right camera is not to the right of the left (baseline {baseline_m:.3f} m)")
+        return cls(K, float(baseline_m))
+
+    def depth(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Depth of the left image's pixels, (H, W) metres, 0 where there is no certain match.
+
+        left, right: rectified images (H, W) or (H, W, 3), of the same size.
+        """
+        scale = self.K[0, 0] * self.baseline_m
+        count = min(_round_up(scale / NEAREST_M, _UNIT), _round_up(left.shape[1], _UNIT))
+        disparity = _disparity(left, right, count)
+        matched = disparity > 0
+        return np.divide(scale, disparity, out=np.zeros_like(disparity), where=matched)
+
+
+def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> NDArray[np.float32]:
+    """Disparities in pixels, below ``count``; not positive where there is no certain match."""
+    channels = 1 if left.ndim == 2 else left.shape[2]
+    matcher = cv2.StereoSGBM_create(
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * channels * _BLOCK**2,
+        P2=32 * channels * _BLOCK**2,
+        disp12MaxDiff=LEFT_RIGHT_TOLERANCE,
+        preFilterCap=63,
+        uniquenessRatio=_UNIQUENESS_PERCENT,
+        speckleWindowSize=_SPECKLE_PIXELS,
+        speckleRange=_SPECKLE_RANGE,
+        mode=_MODE,
+    )
+    # OpenCV leaves the first ``count`` columns unmatched, although much of them is in the right image too:
+    # a margin takes the loss in their place, and matches into the margin are dropped.
+    padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
+    disparity = matcher.compute(*padded)[:, count:].astype(np.float32) / _UNIT
+    disparity[disparity > np.arange(disparity.shape[1], dtype=np.float32)] = 0
+    return disparity
+
+
+def _round_up(value: float, multiple: int) -> int:
+    return int(-(-value // multiple)) * multiple
+
+
+# ------------------------------------------------------------------------------------------- whole recordings
+
+
+@dataclass(frozen=True, slots=True)
+class StereoPair:
+    """The image files of one frame; right is None where there is none."""
+
+    stamp_ns: int
+    left: Path
+    right: Path | None
+
+
+def stereo_frames(
+    rig: StereoRig,
+    pairs: Sequence[StereoPair],
+    framing: Framing,
+    warnings: Counter[str],
+    size: tuple[int, int] | None = None,
+) -> Iterator[CameraFrame]:
+    """Frames of the left camera with depth from stereo, in the order of ``pairs``, on all cores.
+
+    A frame whose left image cannot be decoded is left out, one without a right image has no depth; both
+    are counted. size: (width, height) that the rig is calibrated for, by default that of the first image;
+    an image of another size is a ``LogError``.
+    """
+
+    def load(pair: StereoPair) -> tuple[StereoPair, NDArray[np.uint8] | None, NDArray[np.float32] | None]:
+        left = _read_or_none(pair.left)
+        right = None if pair.right is None else _read_or_none(pair.right)
+        if left is None or right is None:
+            return pair, left, None
+        if right.shape != left.shape:
+            raise LogError(f"{pair.right}: not of the same size as the left image")
+        return pair, left, rig.depth(left, right)
+
+    for pair, left, depth in _ahead(load, pairs):
+        if left is None:
+            warnings["frames skipped (left image cannot be decoded)"] += 1
+            continue
+        if depth is None and pair.right is not None:
+            warnings["frames without depth (right image cannot be decoded)"] += 1
+        height, width = left.shape[:2]
+        size = (width, height) if size is None else size
+        if (width, height) != size:
+            raise LogError(f"{pair.left}: {width}x{height} pixels where {size[0]}x{size[1]} are expected")
+        yield CameraFrame(
+            pair.stamp_ns,
+            framing.image(left),
+            None if depth is None else framing.depth(depth),
+            framing.camera(CameraInfo(width, height, rig.K)),
+        )
+
+
+def _read_or_none(path: Path) -> NDArray[np.uint8] | None:
+    try:
+        return read_image(path)
+    except LogError:
+        return None
+
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+def _ahead(function: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+    """Map in threads (OpenCV lets go of the interpreter), in order, a few results ahead of the consumer."""
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        pending: deque[Future[B]] = deque()
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) > workers:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()

@@ -1,0 +1,37 @@
+"""The names of things in a log, and the message that each topic carries."""
+
+from __future__ import annotations
+
+from fusion_io import messages
+
+IMAGE = "/camera/image"
+DEPTH = "/camera/depth"
+CAMERA_INFO = "/camera/camera_info"
+IMU = "/imu"
+GROUND_TRUTH = "/ground_truth"
+GNSS = "/gnss"
+PAIRS = "/violearner/pairs"
+LOOPS = "/violearner/loops"
+TF = "/tf"
+TF_STATIC = "/tf_static"
+ODOMETRY_PREFIX = "/odometry/"
+
+CAMERA_TOPICS = frozenset({IMAGE, DEPTH, CAMERA_INFO})
+
+_MESSAGE_TYPES = {
+    IMAGE: messages.COMPRESSED_IMAGE,
+    DEPTH: messages.IMAGE,
+    CAMERA_INFO: messages.CAMERA_INFO,
+    IMU: messages.IMU,
+    GROUND_TRUTH: messages.POSE_STAMPED,
+    GNSS: messages.GNSS,
+    PAIRS: messages.PAIR_ESTIMATE,
+    LOOPS: messages.PAIR_ESTIMATE,
+    TF: messages.TRANSFORMS,
+    TF_STATIC: messages.TRANSFORMS,
+}
+
+
+def message_type(topic: str) -> str:
+    """The type that we write on a topic of ours."""
+    return messages.ODOMETRY if topic.startswith(ODOMETRY_PREFIX) else _MESSAGE_TYPES[topic]

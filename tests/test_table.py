@@ -1,0 +1,59 @@
+"""The table of a run is complete and fits where it is printed."""
+
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.spatial.transform import RigidTransform
+
+from fusion.table import ROWS, print_table
+from fusion_io.records import Trajectory
+
+NAMES = ("raw", "posegraph", "ekf")
+
+
+def _trajectory() -> Trajectory:
+    poses = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [4.0, 0.0, 3.0]])
+    return Trajectory(np.arange(3), poses, np.tile(np.eye(6), (3, 1, 1)))
+
+
+def _printed(metrics: dict[str, dict[str, float | None]]) -> str:
+    """What a pipe of 80 columns receives."""
+    file = StringIO()
+    console = Console(file=file, width=80, force_terminal=False)
+    print_table(console, "seq[09].mcap", {name: _trajectory() for name in metrics}, metrics)
+    return file.getvalue()
+
+
+def _metrics(value: float | None) -> dict[str, float | None]:
+    return {row.key: value for row in ROWS}
+
+
+@pytest.mark.parametrize("value", [0.0, 1.5, 1234.5678, 9.87e12])
+def test_every_measure_and_every_trajectory_is_shown_within_80_columns(value: float) -> None:
+    text = _printed({name: _metrics(value) for name in NAMES})
+    assert max(map(len, text.splitlines())) <= 80
+    for row in ROWS:
+        assert sum(row.label in line and row.unit in line for line in text.splitlines()) == 1
+    for heading in ("raw", "pose graph", "EKF", "seq[09].mcap"):
+        assert heading in text
+
+
+def test_numbers_are_shown_in_the_unit_of_their_row() -> None:
+    text = _printed({"raw": _metrics(0.0123)})
+    line = next(line for line in text.splitlines() if "mrad" in line)
+    assert line.split()[-1] == "12.300"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_path_and_stated_uncertainty_need_no_ground_truth(name: str) -> None:
+    text = _printed({name: _metrics(None)})
+    assert "No ground truth" in text
+    assert "t_rel" not in text
+    assert next(line for line in text.splitlines() if "path length" in line).split()[-1] == "7.0"
+    assert next(line for line in text.splitlines() if "1-sigma" in line).split()[-1] == "1.73"
+
+
+def test_a_log_shorter_than_a_segment_says_so() -> None:
+    assert "--segment-lengths" in _printed({"raw": _metrics(1.0) | {"t_rel_percent": None}})
