@@ -81,7 +81,7 @@ def fit(
         value = 0.5 * whitened.square().sum((1, 2)).mean() + L.diagonal(dim1=1, dim2=2).log().sum(1).mean()
         value.backward()
         assert p.grad is not None
-        return float(value), p.grad.numpy()
+        return float(value.detach()), p.grad.numpy()
 
     start = np.concatenate([np.log(0.3 * sizes / spread_sizes), np.log(0.7 * np.ones(6))])
     bounds = [(v - 8, v + 5) for v in start]

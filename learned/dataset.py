@@ -18,6 +18,9 @@ from learned.inputs import NetworkFrame, imu_coverage, imu_window, prepare, to_u
 from learned.violearner import Batch, NetworkConfig
 
 
+CLIPS_A_SHARD = 32
+
+
 @dataclass(frozen=True)
 class Pairs:
     """N pairs as arrays; the fields of `violearner.Batch`, and ground truth for validation only.
@@ -103,7 +106,7 @@ def simulated_shard(seeds: range, frames: int, config: NetworkConfig, path: Path
 
 
 def simulate_shards(
-    folder: Path, clips: int, frames: int, first_seed: int, config: NetworkConfig, workers: int, clips_a_shard: int = 64
+    folder: Path, clips: int, frames: int, first_seed: int, config: NetworkConfig, workers: int, clips_a_shard: int = CLIPS_A_SHARD
 ) -> Iterator[Path]:
     """Render all clips, a shard a task, yielding each file as it is finished (in order of the seeds)."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -31,14 +31,14 @@ class Recipe:
     its decay interval and lambda are not given there: gamma 0.5 every 20,000 steps and 1e-5 are our choice.
     """
 
-    steps: int = 8000
+    steps: int = 5000
     batch: int = 16
     learning_rate: float = 1e-3
     schedule: str = "cosine"
     bias_penalty: float = 1e-5
     gradient_norm: float = 1.0
-    clips: int = 1536
-    frames_a_clip: int = 6
+    clips: int = 640
+    frames_a_clip: int = 9
     validation_share: float = 0.05
     validate_every: int = 250
     imu_dropout: float = 0.1
@@ -57,7 +57,7 @@ WARM_UP_STEPS = 100
 CALIBRATION_SEED = 7_000_000
 """Clips of the covariance fit and the final figures: never seen in training or validation."""
 
-CALIBRATION_CLIPS = 128
+CALIBRATION_CLIPS = 64
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -126,10 +126,10 @@ def render(model: VIOLearner, recipe: Recipe, out: Path, seed: int, workers: int
 def simulated(model: VIOLearner, folder: Path, clips: int, recipe: Recipe, first_seed: int, workers: int) -> Pairs:
     """Pairs of simulated clips, rendered into a folder on the first call."""
     from fusion_io.progress import track
-    from learned.dataset import Pairs, simulate_shards
+    from learned.dataset import CLIPS_A_SHARD, Pairs, simulate_shards
 
     shards = simulate_shards(folder, clips, recipe.frames_a_clip, first_seed, model.config, workers)
-    return Pairs.concatenate(Pairs.load(path) for path in track(shards, f"render {clips} clips", -(-clips // 64)))
+    return Pairs.concatenate(Pairs.load(path) for path in track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD)))
 
 
 def split(pairs: Pairs, count: int) -> tuple[Pairs, Pairs]:

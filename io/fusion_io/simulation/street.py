@@ -24,8 +24,8 @@ LOT_METRES = 13.0  # along the street: one house, garden or gap a side
 GROUND_CELL_METRES = 8.0
 GROUND_REACH_METRES = 56.0  # the ground ends this far from the path; beyond is the backdrop
 TILE_CELL_METRES = 1.0  # grid of the road coordinates
-TILE_CELLS = 32  # a tile of the ground map is 32 m wide
-MAP_REACH_METRES = 30.0  # beyond this from the path the ground is plain grass
+TILE_CELLS = 16  # a tile of the ground map is 16 m wide
+MAP_REACH_METRES = 20.0  # beyond this from the path the ground is plain grass
 SHADOW_FACTOR = 4  # shadows are drawn four times finer than the road coordinates
 MAX_CORNERS = 5
 
@@ -539,7 +539,7 @@ class GroundMap:
 
     @staticmethod
     def _road_coordinates(path: Path, tiles: NDArray[np.int64]) -> NDArray[np.float32]:
-        """(tiles + 1, 33, 33, 2); the last tile is the world beyond."""
+        """(tiles + 1, 17, 17, 2); the last tile is the world beyond."""
         steps = np.arange(TILE_CELLS + 1) * TILE_CELL_METRES
         grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
         points = (tiles * TILE_CELLS * TILE_CELL_METRES)[:, None, None, :] + grid
@@ -557,7 +557,7 @@ class GroundMap:
 
     @staticmethod
     def _draw_sunlight(tiles: NDArray[np.int64], shadows: list[Points], width: float) -> NDArray[np.float32]:
-        """(tiles + 1, 129, 129), 0 in the shade."""
+        """(tiles + 1, 65, 65), 0 in the shade."""
         size = TILE_CELLS * SHADOW_FACTOR + 1
         light = np.ones((len(tiles) + 1, size, size), np.float32)
         scale = (size - 1) / width

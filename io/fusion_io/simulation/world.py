@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fusion_io.records import FloatArray
 from fusion_io.simulation.street import (
+    GROUND_CELL_METRES,
     GroundMap,
     Look,
     Path,
@@ -24,7 +25,7 @@ from fusion_io.simulation.textures import Float32, Surface, library
 
 VIEW_METRES = 120.0  # nothing further away is drawn
 INDEX_METRES = 32.0
-SUPERSAMPLING = 2  # samples a pixel and direction for the colour; depth is that of the pixel's centre
+TENT = np.array([0.25, 0.5, 0.25], np.float32)  # the pixel's filter over samples half a pixel apart
 
 
 class World:
@@ -49,17 +50,17 @@ class World:
         Returns the radiance (H, W) or (H, W, 3), where 1 is white and more is possible, and the
         exact depth (H, W) in metres along the optical axis at the pixels' centres, 0 for the sky.
         """
-        view = _View(self._polygons, self._nearby(T_world_camera), T_world_camera)
-        _, inverse_depth = view.cast(K, width, height)
-        with np.errstate(divide="ignore"):
-            depth = np.where(inverse_depth > 0, 1.0 / inverse_depth, 0.0).astype(np.float32)
-        s = SUPERSAMPLING
+        view = _View(self._polygons, self._nearby(T_world_camera), T_world_camera, K, width, height)
+        # Samples lie every half pixel, pixel centres among them, with a margin of one sample.
         fine = K.copy()
-        fine[:2] *= s
-        fine[:2, 2] += 0.5 * s - 0.5
-        hits, inverse_depth = view.cast(fine, width * s, height * s)
+        fine[:2] *= 2.0
+        fine[:2, 2] += 1.0
+        hits, inverse_depth = view.cast(fine, 2 * width + 1, 2 * height + 1)
+        centres = inverse_depth[1::2, 1::2]
+        depth = np.zeros_like(centres)
+        np.divide(1.0, centres, out=depth, where=centres > 0)
         radiance = self._shade(view, hits, inverse_depth, fine, colour)
-        return cv2.resize(radiance, (width, height), interpolation=cv2.INTER_AREA), depth
+        return cv2.sepFilter2D(radiance, -1, TENT, TENT)[1::2, 1::2], depth
 
     def _nearby(self, T_world_camera: FloatArray) -> NDArray[np.int64]:
         """Indices of the polygons in the cells about the camera."""
@@ -151,13 +152,26 @@ class World:
 class _View:
     """The polygons that may be seen from one pose, in camera axes."""
 
-    def __init__(self, polygons: Polygons, candidates: NDArray[np.int64], T_world_camera: FloatArray) -> None:
+    def __init__(
+        self,
+        polygons: Polygons,
+        candidates: NDArray[np.int64],
+        T_world_camera: FloatArray,
+        K: FloatArray,
+        width: int,
+        height: int,
+    ) -> None:
         self.rotation, self.position = T_world_camera[:3, :3], T_world_camera[:3, 3]
         first = polygons.corners[candidates, 0] - self.position
         facing = np.einsum("ij,ij->i", polygons.normals[candidates], first) < -1e-6
+        facing &= np.einsum("ij,ij->i", first, first) < VIEW_METRES**2
+        facing &= first @ self.rotation[:, 2] > -GROUND_CELL_METRES * 2
         candidates = candidates[facing]
         corners = (polygons.corners[candidates] - self.position) @ self.rotation
-        seen = (corners[:, :, 2] > 0.05).any(axis=1) & (np.linalg.norm(corners[:, 0], axis=1) < VIEW_METRES)
+        # A polygon is out of sight if all its corners are outside of one side of the view's pyramid.
+        sides = np.array([[1, 0, 1], [-1, 0, width], [0, 1, 1], [0, -1, height], [0, 0, 1]]) @ K
+        outside = corners @ sides.T < 0
+        seen = ~outside.all(axis=1).any(axis=1)
         candidates, corners = candidates[seen], corners[seen]
         self._corners = corners
         self._normals = polygons.normals[candidates] @ self.rotation
@@ -229,12 +243,12 @@ def _spans(
     """The columns [left, right) of every row (F, H) that lie inside all edges (F, 5, 3) of each polygon."""
     centre_pixels = centres @ K.T
     sign = np.sign(np.einsum("fej,fj->fe", edges, centre_pixels))
-    a, b, c = np.moveaxis((edges * sign[..., None]).astype(np.float64), 2, 0)
-    rest = b[..., None] * np.arange(height) + c[..., None]
+    a, b, c = np.moveaxis((edges * sign[..., None]).astype(np.float32), 2, 0)
+    rest = b[..., None] * np.arange(height, dtype=np.float32) + c[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
         bound = -rest / a[..., None]
-    left = np.where(a[..., None] > 0, bound, 0.0).max(axis=1)
-    right = np.where(a[..., None] < 0, bound, width - 1.0).min(axis=1)
+    left = np.where(a[..., None] > 0, bound, np.float32(0)).max(axis=1)
+    right = np.where(a[..., None] < 0, bound, np.float32(width - 1)).min(axis=1)
     empty = ((a[..., None] == 0) & (rest < 0)).any(axis=1)
     first = np.ceil(np.clip(left, 0, width)).astype(np.int32)
     last = np.floor(np.clip(right, -1, width - 1)).astype(np.int32) + 1
