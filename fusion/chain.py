@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from functools import reduce
 from itertools import accumulate, pairwise
 from operator import mul
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -27,6 +28,21 @@ UNKNOWN_GYRO_RATE = 0.01  # rad/s
 MAX_IMU_PERIODS = 2.5
 
 
+class ImuWindow(NamedTuple):
+    """An IMU over an interval of time, in M pieces that fill it.
+
+    durations (M,) s; the mean angular_velocity (M, 3) rad/s and linear_acceleration (M, 3) m/s^2 during each.
+    """
+
+    durations: FloatArray
+    angular_velocity: FloatArray
+    linear_acceleration: FloatArray
+
+    def rotation(self, bias: FloatArray) -> Rotation:
+        """R_start_end by the gyro, less its bias (3,) rad/s."""
+        return reduce(mul, Rotation.from_rotvec((self.angular_velocity - bias) * self.durations[:, None]))
+
+
 class ImuWindows:
     """The samples of an IMU over any interval of time, linear between them."""
 
@@ -35,27 +51,22 @@ class ImuWindows:
         self._values = np.hstack([imu.angular_velocity, imu.linear_acceleration])
         self._longest_ns = MAX_IMU_PERIODS * np.median(np.diff(self._stamps)) if len(imu) > 1 else 0.0
 
-    def over(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Durations (M,) s that fill the interval, mean angular velocity (M, 3) and acceleration (M, 3) during each.
-
-        None where the samples do not reach from start to end without a hole.
-        """
+    def over(self, start_ns: int, end_ns: int) -> ImuWindow | None:
+        """The window from start to end, or None where the samples do not cover all of it without a hole."""
         first = int(np.searchsorted(self._stamps, start_ns, side="right")) - 1
         last = int(np.searchsorted(self._stamps, end_ns))
         if first < 0 or last >= len(self._stamps):
             return None
-        stamps = self._stamps[first : last + 1]
-        if np.max(np.diff(stamps)) > self._longest_ns:
+        stamps, values = self._stamps[first : last + 1], self._values[first : last + 1]
+        gaps = np.diff(stamps)
+        if np.max(gaps) > self._longest_ns:
             return None
-        knots = np.clip(stamps, start_ns, end_ns)
-        values = self._values[first : last + 1]
-        edges = [
-            values[k] + (values[k + 1] - values[k]) * ((knot - stamps[k]) / (stamps[k + 1] - stamps[k]))
-            for k, knot in ((0, start_ns), (-2, end_ns))
-        ]
-        values = np.vstack([edges[0], values[1:-1], edges[1]])
-        means = (values[1:] + values[:-1]) / 2
-        return np.diff(knots) / NANOSECONDS, means[:, :3], means[:, 3:]
+        at_start = values[0] + (values[1] - values[0]) * ((start_ns - stamps[0]) / gaps[0])
+        at_end = values[-1] - (values[-1] - values[-2]) * ((stamps[-1] - end_ns) / gaps[-1])
+        edges = np.vstack([at_start, values[1:-1], at_end])
+        means = (edges[1:] + edges[:-1]) / 2
+        seconds = np.clip(stamps - start_ns, 0, end_ns - start_ns) / NANOSECONDS
+        return ImuWindow(np.diff(seconds), means[:, :3], means[:, 3:])
 
 
 def adjoint(transform: RigidTransform) -> FloatArray:
@@ -204,11 +215,7 @@ class _Gyro:
     def rotation(self, start_ns: int, end_ns: int) -> Rotation | None:
         """The rotation R_start_end, or None where the gyro did not measure all of it."""
         window = self._windows.over(start_ns, end_ns) if self._windows else None
-        if window is None:
-            return None
-        durations, rates, _ = window
-        increments = Rotation.from_rotvec((rates - self._bias) * durations[:, None])
-        return reduce(mul, increments)
+        return window.rotation(self._bias) if window else None
 
 
 def _step(start_ns: int, end_ns: int, motion: RigidTransform, covariance: FloatArray) -> PairEstimate:

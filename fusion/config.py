@@ -36,7 +36,9 @@ class TopicsConfig(Section):
     accelerometer: str | None = None
     ground_truth: str | None = None
     pairs: str | None = None
+    loops: str | None = None
     gnss: str | None = None
+    tf_static: str | None = None
 
 
 class FrontendConfig(Section):
@@ -69,7 +71,25 @@ class ImuConfig(Section):
 
 
 class PoseGraphConfig(Section):
-    """The pose graph back end."""
+    """The pose graph back end.
+
+    The noise of the IMU is that of consumer devices, widened by what the model leaves out: gyro_noise (rad/s/sqrt(Hz))
+    by errors of mounting and time, accelerometer_noise (m/s^2/sqrt(Hz)) by the unknown lever arm to the camera and by
+    errors of the pairs that are correlated in time. *_bias_walk: how biases wander (rad/s^2, m/s^3, per sqrt(Hz)).
+    *_bias_sigma: how far they may be from zero (rad/s, m/s^2); corrected_gyro_bias_sigma where a navigation system
+    has removed the gyro's already. pair_rotation_rate_sigma (rad/s): constant rate errors that a front end is taken
+    to be capable of. gate_probability: how seldom noise alone rejects the IMU over one step.
+    """
+
+    gyro_noise: PositiveFloat = 5e-4
+    accelerometer_noise: PositiveFloat = 0.5
+    gyro_bias_walk: PositiveFloat = 1e-5
+    accelerometer_bias_walk: PositiveFloat = 1e-4
+    gyro_bias_sigma: PositiveFloat = 1e-2
+    corrected_gyro_bias_sigma: PositiveFloat = 2e-4
+    accelerometer_bias_sigma: PositiveFloat = 0.1
+    pair_rotation_rate_sigma: PositiveFloat = 5e-4
+    gate_probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
 
 class EkfConfig(Section):

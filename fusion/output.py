@@ -9,18 +9,22 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fusion import plots
 from fusion.config import RunConfig, to_toml
 from fusion.evaluation import Metrics
 from fusion.imu import ImuCalibration
 from fusion_io.errors import LogError, UsageError
+from fusion_io.findings import Findings
+from fusion_io.messages import CAMERA_FRAME
 from fusion_io.reader import Log
-from fusion_io.records import NANOSECONDS, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, ImuSeries, PairEstimate, Trajectory
 from fusion_io.trajectory_files import write_kitti, write_tum
 from fusion_io.writer import LogWriter
 
@@ -28,22 +32,11 @@ SCHEMA = 1
 LOG_NAME = "run.mcap"
 TRAJECTORIES = ("raw", "posegraph", "ekf")
 
+# What sensor_msgs/CameraInfo calls uncalibrated: K is zero.
+NOT_CALIBRATED = CameraInfo(0, 0, np.zeros((3, 3)))
+
 # The packages whose versions decide the numbers of a run.
 PACKAGES = ("violearner-fusion", "numpy", "scipy", "torch", "gtsam", "filterpy", "opencv-python-headless", "mcap")
-
-
-@dataclass
-class Findings:
-    """What a run has to warn of: counts by name for metrics.json, and a line each for the user."""
-
-    counts: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    def add(self, name: str, count: int, note: str) -> None:
-        """Count a warning; a count of zero is none."""
-        if count:
-            self.counts[name] = count
-            self.notes.append(note)
 
 
 @dataclass(frozen=True)
@@ -96,13 +89,7 @@ def write_log(folder: Path, outcome: Outcome) -> None:
             writer.ground_truth(outcome.ground_truth)
         for name, trajectory in outcome.trajectories.items():
             writer.trajectory(name, trajectory)
-        if outcome.config.record == "all":
-            for frame in outcome.log.frames():
-                writer.frame(frame)
-        else:
-            camera = outcome.log.camera_info()
-            for stamp_ns in outcome.log.frame_stamps():
-                writer.camera_info(int(stamp_ns), camera)
+        _write_frames(writer, outcome)
 
 
 def write_text(folder: Path, outcome: Outcome) -> None:
@@ -150,7 +137,7 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
             "imu_samples": len(outcome.imu),
             "warnings": {**log.warnings, **outcome.findings.counts},
         },
-        "trajectories": {name: asdict(metrics) for name, metrics in outcome.metrics.items()},
+        "trajectories": {name: _values(outcome, name) for name in outcome.metrics},
         "calibration": {
             "rotation_imu_camera_quat_wxyz": None if mounting is None else mounting.as_quat(scalar_first=True).tolist(),
             "time_offset_s": calibration.time_offset_s,
@@ -159,6 +146,33 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
         },
         "timing": {**seconds, "total": total, "realtime_factor": outcome.duration_s / total},
     }
+
+
+def _write_frames(writer: LogWriter, outcome: Outcome) -> None:
+    """Stream the frames in the frame id that the mounting in our logs refers to: whole, or stamp and camera alone."""
+    log, last_ns = outcome.log, -1
+    if outcome.config.record == "all" and log.has_frames:
+        for frame in _as_far_as_readable(log.frames(), outcome.findings):
+            writer.frame(replace(frame, camera=replace(frame.camera, frame_id=CAMERA_FRAME)))
+            last_ns = frame.stamp_ns
+    camera = replace(log.camera_info() or NOT_CALIBRATED, frame_id=CAMERA_FRAME)
+    stamps = log.frame_stamps()
+    for stamp_ns in stamps[stamps > last_ns].tolist():
+        writer.camera_info(stamp_ns, camera)
+
+
+def _as_far_as_readable(frames: Iterator[CameraFrame], findings: Findings) -> Iterator[CameraFrame]:
+    """The frames up to the first that has no place in a log: results from recorded pairs shall not be lost for it."""
+    try:
+        yield from frames
+    except LogError as error:
+        findings.put("images_not_copied", 1, f"images are left out of {LOG_NAME} from here on: {error}")
+
+
+def _values(outcome: Outcome, name: str) -> dict[str, float | int | None]:
+    """The measures of a trajectory; without ground truth not even the number of segments is known."""
+    values = asdict(outcome.metrics[name])
+    return values if outcome.ground_truth is not None else dict.fromkeys(values)
 
 
 def _provenance(outcome: Outcome) -> dict[str, dict[str, str]]:

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from fusion.config import FrontendConfig, ImuConfig, RunConfig
-    from fusion.output import Findings, Outcome
+    from fusion.output import Outcome
+    from fusion_io.findings import Findings
     from fusion_io.reader import Log
     from fusion_io.records import ImuSeries, PairEstimate, Trajectory
 
@@ -43,12 +44,13 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
     stopwatch = Stopwatch()
     from fusion import chain, imu, output
     from fusion.evaluation import evaluate
+    from fusion_io.findings import Findings
     from fusion_io.reader import open_log
 
     log = open_log(log_path, config.topics.model_dump(exclude_none=True))
     folder = output.prepare_folder(out or default_folder(log_path), log_path)
     samples, ground_truth = log.imu(), log.ground_truth()
-    findings = output.Findings()
+    findings = Findings()
     stopwatch.lap("read")
 
     pairs = pair_estimates(log, samples, config.frontend, findings)
@@ -56,10 +58,12 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
 
     calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
     inertial = imu.in_camera_axes(samples, calibration) if calibration.used else None
+    faulty = len(calibration.faulty_ns)
+    findings.put("imu_faulty_stretches", faulty, f"stretches where the gyro contradicts the pairs, left out: {faulty}")
     stopwatch.lap("calibration")
 
     steps, gaps = chain.bridge_gaps(log.frame_stamps(), pairs, inertial)
-    findings.add("gaps_bridged", gaps, "gaps between pair estimates were bridged")
+    findings.put("gaps_bridged", gaps, f"gaps between pair estimates that were bridged: {gaps}")
     trajectories = {"raw": chain.chain(steps)}
     stopwatch.lap("raw")
 
@@ -104,7 +108,7 @@ def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: F
     estimates = estimate_pairs(log, imu, config.weights, frames, skipped)
     pairs = [decode_pair(encode_pair(pair)) for pair in estimates]
     for name, count in skipped.items():
-        findings.add(name, count, name.replace("_", " "))
+        findings.put(name, count, f"{name.replace('_', ' ')}: {count}")
     if not pairs:
         raise LogError(f"{log.path}: no pair of frames could be estimated, of {len(log.frame_stamps())} frames")
     return pairs
@@ -127,19 +131,23 @@ def back_ends(config: RunConfig) -> Sequence[str]:
 def fuse(
     name: str, steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: RunConfig, findings: Findings
 ) -> dict[str, Trajectory]:
-    """The trajectory of a back end by its name; empty, and counted, where it fails: the other results shall come out."""
+    """The trajectory of a back end by its name; empty, and counted, where it fails: the others shall still come out."""
     from numpy.linalg import LinAlgError
 
     from fusion import ekf, posegraph
 
     try:
         if name == "posegraph":
-            return {name: posegraph.solve(steps, inertial, config.posegraph)}
+            graph = posegraph.solve(steps, inertial, config.posegraph)
+            findings.put("posegraph_rejected", graph.rejected, f"steps left out of the IMU factors: {graph.rejected}")
+            return {name: graph.trajectory}
         filtered = ekf.solve(steps, inertial, config.ekf)
-        findings.add("ekf_rejected", filtered.rejected, "pair estimates were rejected by the EKF's gate")
+        findings.put(
+            "ekf_rejected", filtered.rejected, f"pair estimates stopped by the EKF's gate: {filtered.rejected}"
+        )
         return {name: filtered.trajectory}
     except (FusionError, LinAlgError, RuntimeError) as error:  # GTSAM's solvers raise RuntimeError
-        findings.add(f"{name}_failed", 1, f"back end {name} failed: {' '.join(str(error).split())}")
+        findings.put(f"{name}_failed", 1, f"back end failed ({name}): {' '.join(str(error).split())}")
         return {}
 
 
@@ -220,7 +228,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         metavar="ROLE=NAME",
         help="the topic of a role where the log leaves it open; roles: image, depth, camera_info, imu, gyro, "
-        "accelerometer, ground_truth, pairs, gnss; may be repeated",
+        "accelerometer, ground_truth, pairs, loops, gnss, tf_static; may be repeated",
     )
     return parser
 

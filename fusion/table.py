@@ -80,8 +80,8 @@ def _number(value: float, decimals: int) -> str:
 
 
 def _legend(metrics: Mapping[str, Metrics]) -> str:
-    if all(value is None for values in metrics.values() for value in values.values()):
-        return "No ground truth in the log, so no errors can be given."
+    if all(values["ate_m"] is None for values in metrics.values()):
+        return "No ground truth for these frames in the log, so no errors can be given."
     if all(values["t_rel_percent"] is None for values in metrics.values()):
         return "Lower is better. No t_rel: the path is shorter than the shortest of --segment-lengths."
     return "Lower is better; an ANEES above 3 is overconfident."

@@ -9,7 +9,7 @@ weights.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +17,10 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import RigidTransform
 
 from fusion_io.records import FloatArray
+
+
+LEAST_GROWTH = 0.1
+"""A pair without its IMU never counts as surer than one with it."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,13 @@ def fit(
     start = np.concatenate([np.log(0.3 * sizes / spread_sizes), np.log(0.7 * np.ones(6))])
     bounds = [(v - 8, v + 5) for v in start]
     found = minimize(negative_log_likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds)
-    model = CovarianceModel(tuple(np.exp(found.x[:6])), tuple(np.exp(found.x[6:]) * sizes), 0.0)
-    scale = np.sqrt(mean_nees(errors, model.covariance(spread, np.ones(len(errors)))) / 6)
-    model = CovarianceModel(tuple(np.array(model.gain) * scale), tuple(np.array(model.floor) * scale), 0.0)
+    gain, floor = np.exp(found.x[:6]), np.exp(found.x[6:]) * sizes
+    nees = mean_nees(errors, model_of(gain, floor, 1.0).covariance(spread, np.ones(len(errors))))
+    model = model_of(gain, floor, np.sqrt(nees / 6))
     without = mean_nees(errors_without_imu, model.covariance(spread_without_imu, np.ones(len(errors_without_imu))))
-    return CovarianceModel(model.gain, model.floor, max(float(np.sqrt(without / 6)) - 1, 0.1))
+    return replace(model, missing_imu=max(float(np.sqrt(without / 6)) - 1, LEAST_GROWTH))
+
+
+def model_of(gain: FloatArray, floor: FloatArray, scale: float) -> CovarianceModel:
+    """Arrays as a model of plain numbers, sigmas scaled."""
+    return CovarianceModel(tuple((scale * gain).tolist()), tuple((scale * floor).tolist()), 0.0)

@@ -31,7 +31,7 @@ class Recipe:
     its decay interval and lambda are not given there: gamma 0.5 every 20,000 steps and 1e-5 are our choice.
     """
 
-    steps: int = 5000
+    steps: int = 4500
     batch: int = 16
     learning_rate: float = 1e-3
     schedule: str = "cosine"
@@ -157,6 +157,7 @@ def optimise(
 
     from learned.violearner import loss
 
+    out.mkdir(parents=True, exist_ok=True)
     optimiser = torch.optim.Adam(model.parameters(), recipe.learning_rate, betas=MOMENTA)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(recipe, step))
     checkpoint = out / "checkpoint.pt"

@@ -63,9 +63,7 @@ def test_paper_preset_is_the_papers_network() -> None:
 
 @pytest.mark.parametrize("preset", ["fast", "paper"])
 def test_forward_gives_five_levels_and_four_hypotheses(preset: str) -> None:
-    config = dataclasses.replace(
-        PRESETS[preset], trunk_filters=8, extra_filters=8, imu_filters=(4, 4, 8, 8, 8, 8, 8)
-    )
+    config = dataclasses.replace(PRESETS[preset], trunk_filters=8, extra_filters=8, imu_filters=(4, 4, 8, 8, 8, 8, 8))
     estimate = VIOLearner(config)(random_batch(config))
     assert [tuple(p.shape) for p in estimate.poses] == [(2, 6)] * 5
     assert estimate.hypotheses.shape == (2, 4, 6)

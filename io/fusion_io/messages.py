@@ -8,6 +8,7 @@ depth images: REP 118. Decoding raises ``ValueError`` for a message whose conten
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -79,6 +80,8 @@ _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
 }
 _DEPTH_ENCODINGS = {"32FC1": "f4", "16UC1": "u2"}
 _MILLIMETRES = 1000.0
+_DEPTH_TRANSPORT = "compressedDepth"
+_DEPTH_TRANSPORT_HEADER = struct.Struct("<iff")
 
 _STAMP_LITTLE = struct.Struct("<iI")
 _STAMP_BIG = struct.Struct(">iI")
@@ -86,11 +89,11 @@ _STAMP_BIG = struct.Struct(">iI")
 
 def schema_text(type_name: str) -> str:
     """The definition of a message with those it refers to, as MCAP's ``ros2msg`` encoding wants it."""
-    generated, _ = TYPESTORE.generate_msgdef(type_name, ros_version=2)
+    generated: str = TYPESTORE.generate_msgdef(type_name, ros_version=2)[0]
     if type_name != PAIR_ESTIMATE:
-        return str(generated)
+        return generated
     _, separator, references = generated.partition("=" * 80)  # rosbags drops comments: ours are worth keeping
-    return PAIR_ESTIMATE_DEFINITION + separator + str(references)
+    return PAIR_ESTIMATE_DEFINITION + separator + references
 
 
 def header_stamp(data: bytes | memoryview, offset: int = 0) -> int:
@@ -148,26 +151,22 @@ def decode_depth(type_name: str, data: bytes | memoryview) -> NDArray[np.float32
     """Depth (H, W) in metres, 0 where there is none, from 32FC1 (metres) or 16 bits (millimetres)."""
     message = _deserialise(type_name, data)
     if type_name == COMPRESSED_IMAGE:
-        stored = _uncompressed(message)
-        if stored.dtype != np.uint16 or stored.ndim != 2:
-            raise ValueError("a compressed depth image must have one channel of 16 bits")
-    elif message.encoding in _DEPTH_ENCODINGS:
-        stored = _pixels(message, _DEPTH_ENCODINGS[message.encoding], 1)
-    else:
-        raise ValueError(f"depth encoded as {message.encoding!r} cannot be read")
-    if stored.dtype == np.uint16:
-        return (stored / _MILLIMETRES).astype(np.float32)
-    return _valid_depth(stored)
+        return _compressed_depth(message)
+    if message.encoding in _DEPTH_ENCODINGS:
+        return _metres(_pixels(message, _DEPTH_ENCODINGS[message.encoding], 1))
+    raise ValueError(f"depth encoded as {message.encoding!r} cannot be read")
 
 
 def image_kind(type_name: str, data: bytes | memoryview) -> str:
-    """What an Image or CompressedImage holds: "image", "depth" or "" for what cannot be read."""
+    """What an Image or CompressedImage holds: "image" or "depth"."""
     message = _deserialise(type_name, data)
     if type_name == COMPRESSED_IMAGE:
-        return "depth" if message.format.startswith("16UC1") else "image"
+        return "depth" if message.format.startswith("16UC1") or _DEPTH_TRANSPORT in message.format else "image"
     if message.encoding in _DEPTH_ENCODINGS:
         return "depth"
-    return "image" if message.encoding in _IMAGE_ENCODINGS else ""
+    if message.encoding in _IMAGE_ENCODINGS:
+        return "image"
+    raise ValueError(f"an image encoded as {message.encoding!r} cannot be read")
 
 
 def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any]:
@@ -184,8 +183,31 @@ def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any]:
     return pixels if channels == 1 else pixels.reshape(message.height, message.width, channels)
 
 
-def _uncompressed(message: Any) -> NDArray[Any]:
-    stored = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED) if len(message.data) else None
+def _compressed_depth(message: Any) -> NDArray[np.float32]:
+    """A 16-bit image in millimetres, or what ROS' compressed_depth_image_transport makes of depth (its codec.cpp).
+
+    That begins with twelve bytes: a format and two parameters a and b. The 16 bits of a pixel are millimetres, or
+    a / depth + b where the depth was in metres.
+    """
+    transport = _DEPTH_TRANSPORT in message.format
+    stored = _uncompressed(message, _DEPTH_TRANSPORT_HEADER.size if transport else 0)
+    if stored.dtype != np.uint16 or stored.ndim != 2:
+        raise ValueError("a compressed depth image must have one channel of 16 bits")
+    if not (transport and message.format.startswith("32FC1")):
+        return _metres(stored)
+    _, a, b = _DEPTH_TRANSPORT_HEADER.unpack_from(message.data)
+    with np.errstate(divide="ignore"):
+        return _valid_depth(np.where(stored > 0, a / (stored - b), 0))
+
+
+def _metres(depth: NDArray[Any]) -> NDArray[np.float32]:
+    """Stored depth as metres: whole numbers are millimetres (REP 118)."""
+    return _valid_depth(depth / _MILLIMETRES if depth.dtype == np.uint16 else depth)
+
+
+def _uncompressed(message: Any, start: int = 0) -> NDArray[Any]:
+    packed = np.asarray(message.data)[start:]
+    stored: NDArray[Any] | None = cv2.imdecode(packed, cv2.IMREAD_UNCHANGED) if len(packed) else None
     if stored is None:
         raise ValueError(f"an image compressed as {message.format!r} cannot be unpacked")
     return stored
@@ -234,11 +256,12 @@ def encode_camera_info(stamp_ns: int, info: CameraInfo) -> bytes:
 
 
 def decode_camera_info(data: bytes | memoryview, rectified: bool = False) -> CameraInfo:
-    """CameraInfo of the raw image, or of the rectified one (P in place of K, and no distortion).
+    """CameraInfo of the raw image, or of the rectified one (P in place of K if it is given, and no distortion).
 
     Where the message names a region of interest, the intrinsics are those of that region.
     """
     message = _deserialise(CAMERA_INFO, data)
+    rectified = rectified and message.p[0] > 0
     K = message.p.reshape(3, 4)[:, :3].copy() if rectified else message.k.reshape(3, 3).copy()
     if not np.all(np.isfinite(K)) or K[0, 0] <= 0 or K[1, 1] <= 0 or not message.width or not message.height:
         raise ValueError("the camera is not calibrated (no focal length or no size)")
@@ -308,13 +331,14 @@ _NOT_MEASURED = np.array([-1.0, 0, 0, 0, 0, 0, 0, 0, 0])
 def _isotropic(deviation: float | None, measured: bool) -> FloatArray:
     if not measured:
         return _NOT_MEASURED
-    return (np.eye(3) * (deviation or 0.0) ** 2).ravel()
+    variance = (deviation or 0.0) ** 2
+    return np.array([variance, 0, 0, 0, variance, 0, 0, 0, variance])
 
 
 def _deviation(covariance: FloatArray) -> float | None:
     """The largest of the three standard deviations."""
-    variance = float(covariance.reshape(3, 3).diagonal().max())
-    return float(np.sqrt(variance)) if 0 < variance < np.inf else None
+    variance = max(covariance[0], covariance[4], covariance[8])
+    return math.sqrt(variance) if 0 < variance < math.inf else None
 
 
 # --- Poses --------------------------------------------------------------------------------------

@@ -27,10 +27,10 @@ NEAREST_M = 3.2
 #: A depth is refused where the match back from the right image lands further away than this (pixels).
 LEFT_RIGHT_TOLERANCE = 1
 
-_MODE = cv2.StereoSGBM_MODE_SGBM
-_BLOCK = 5
-_UNIQUENESS_PERCENT = 5
-_SPECKLE_PIXELS = 100
+_MODE = cv2.StereoSGBM_MODE_SGBM_3WAY
+_BLOCK = 7
+_UNIQUENESS_PERCENT = 10
+_SPECKLE_PIXELS = 400
 _SPECKLE_RANGE = 2
 #: OpenCV's disparities are integers in units of 1/16 pixel, and their number is a multiple of 16.
 _UNIT = 16

@@ -88,7 +88,7 @@ class LogWriter:
         try:
             with self._expected_errors():
                 self._write_until(None)
-                self._writer.finish()
+                self._writer.finish()  # type: ignore[no-untyped-call]
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
                 self._stream.close()
@@ -102,14 +102,14 @@ class LogWriter:
 
     def frame(self, frame: CameraFrame) -> None:
         """Image, depth if there is one, and camera info."""
-        self.image(frame.stamp_ns, frame.image)
+        self.image(frame.stamp_ns, frame.image, frame.camera.frame_id)
         if frame.depth is not None:
             self.depth(frame.stamp_ns, frame.depth, frame.camera.frame_id)
         self.camera_info(frame.stamp_ns, frame.camera)
 
-    def image(self, stamp_ns: int, image: NDArray[np.uint8]) -> None:
+    def image(self, stamp_ns: int, image: NDArray[np.uint8], frame_id: str = CAMERA_FRAME) -> None:
         """A grey (H, W) or RGB (H, W, 3) image."""
-        self._add_image(stamp_ns, topics.IMAGE, messages.encode_image(stamp_ns, image))
+        self._add_image(stamp_ns, topics.IMAGE, messages.encode_image(stamp_ns, image, frame_id))
 
     def depth(self, stamp_ns: int, depth: NDArray[np.float32], frame_id: str = CAMERA_FRAME) -> None:
         """Depth (H, W) in metres, rounded to 1/256 m."""

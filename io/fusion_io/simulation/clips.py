@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, FloatArray, ImuSeries, IntArray, Trajectory
 from fusion_io.simulation.motion import ROTATION_IMU_CAMERA_KITTI, DriveStyle, ImuModel, Motion, drive, simulate_imu
+from fusion_io.simulation.street import Path
 from fusion_io.simulation.world import Float32, World
 
 IMU_MARGIN_S = 0.25  # IMU samples before the first and after the last frame
@@ -16,20 +17,12 @@ KITTI_FRAME_S = 0.1037
 KITTI_TIME_OFFSET_S = 0.065
 MAX_DEPTH_M = 80.0
 KITTI_BASELINE_M = 0.54
-ROAD_AHEAD_M = 130.0
-ROAD_BEHIND_M = 30.0
 
 
-def ground_path(motion: Motion, camera_height_m: float) -> FloatArray:
-    """The ground (N, 3) under the camera along a motion, with straight road before and after it."""
-    times = np.arange(motion.start_s, motion.end_s + 0.05, 0.05).clip(max=motion.end_s)
-    poses = motion.poses(times)
-    points = poses.translation - [0.0, 0.0, camera_height_m]
-    forward = poses.rotation[[0, -1]].apply([0.0, 0.0, 1.0]) * [1.0, 1.0, 0.0]
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    before = points[0] - np.arange(ROAD_BEHIND_M, 0.0, -1.0)[:, None] * forward[0]
-    after = points[-1] + np.arange(1.0, ROAD_AHEAD_M)[:, None] * forward[1]
-    return np.concatenate([before, points, after])
+def path_of(motion: Motion, camera_height_m: float) -> Path:
+    """The path of a motion."""
+    times = np.linspace(motion.start_s, motion.end_s, int((motion.end_s - motion.start_s) / 0.05) + 2)
+    return Path(motion.poses(times), camera_height_m)
 
 
 def exposed(radiance: Float32, gain: float, offset: float = 0.0, noise: Float32 | None = None) -> NDArray[np.uint8]:
@@ -91,7 +84,7 @@ def clip(
     style = _style(rng)
     start, end = times[0] - IMU_MARGIN_S - 0.2, times[-1] + IMU_MARGIN_S + 0.2
     motion = drive(int(rng.integers(2**31)), start, end, style)
-    world = World(int(rng.integers(2**31)), ground_path(motion, style.camera_height_m))
+    world = World(int(rng.integers(2**31)), path_of(motion, style.camera_height_m))
     camera = _camera(rng, width, height)
     trajectory = Trajectory(stamps, motion.poses(times))
     images = _Imager(rng, world, camera, exact_depth)
@@ -109,7 +102,7 @@ def _frame_stamps(rng: np.random.Generator, frames: int) -> IntArray:
 def _style(rng: np.random.Generator) -> DriveStyle:
     standing = rng.random() < 0.06
     return DriveStyle(
-        speed_mps=0.0 if standing else rng.uniform(0.0, 18.0),
+        speed_mps=0.0 if standing else rng.uniform(0.0, 20.0),
         speed_change_mps=0.0 if standing else rng.uniform(0.3, 3.0),
         yaw_rate=rng.choice([0.02, 0.08, 0.35]),
         shake=rng.uniform(0.3, 2.5),

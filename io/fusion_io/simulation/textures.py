@@ -138,45 +138,60 @@ def _tiles() -> list[Float32]:
 
 
 class Textures:
-    """All tiles with their pyramids in one flat array."""
+    """All tiles with their pyramids in one image, so that OpenCV's remap can interpolate in it.
+
+    Each tile has a band of the image: the full resolution at its left, the coarser levels one below
+    the other at its right, each with a border of one texel that continues it periodically.
+    """
 
     def __init__(self) -> None:
-        sizes = [TILE_TEXELS >> level for level in range(LEVELS)]
-        self._offsets = np.cumsum([0] + [size * size for size in sizes]).astype(np.int32)
-        self._values = np.concatenate([self._pyramid(tile, sizes) for tile in _tiles()])
+        tiles = _tiles()
+        band, width = TILE_TEXELS + 2 * LEVELS, TILE_TEXELS + 2 + TILE_TEXELS // 2 + 2
+        self._image = np.zeros((band * len(tiles), width), np.float32)
+        places = [(0, 0)]
+        for level in range(1, LEVELS):
+            places.append((places[-1][0] + (TILE_TEXELS >> (level - 1)) + 2 if level > 1 else 0, TILE_TEXELS + 2))
+        for index, tile in enumerate(tiles):
+            clipped = np.clip(tile, 0.02, 1.0).astype(np.float32)
+            for level, (row, column) in enumerate(places):
+                size = TILE_TEXELS >> level
+                small = cv2.resize(clipped, (size, size), interpolation=cv2.INTER_AREA)
+                rows = slice(index * band + row, index * band + row + size + 2)
+                self._image[rows, column : column + size + 2] = np.pad(small, 1, mode="wrap")
+        # Texel centres are integers in remap: the middle of a level's first texel is half a texel in.
+        self._rows = np.array([[index * band + row + 0.5 for row, _ in places] for index in range(len(tiles))]).ravel()
+        self._columns = np.array([column + 0.5 for _, column in places] * len(tiles))
+        self._rows, self._columns = self._rows.astype(np.float32), self._columns.astype(np.float32)
+        self._sizes = (TILE_TEXELS >> np.arange(LEVELS)).astype(np.float32)
 
-    @staticmethod
-    def _pyramid(tile: Float32, sizes: list[int]) -> Float32:
-        tile = np.clip(tile, 0.02, 1.0).astype(np.float32)
-        levels = [cv2.resize(tile, (size, size), interpolation=cv2.INTER_AREA).ravel() for size in sizes]
-        return np.concatenate(levels)
-
-    def lookup(self, surface: NDArray[np.int32], u: Float32, v: Float32, footprint: Float32) -> Float32:
-        """Albedo (N,) at u, v (N,) metres on the tiles ``surface`` (N,), averaged over ``footprint`` (N,) metres."""
-        level = np.clip(np.log2(footprint * np.float32(1 / TEXEL_METRES)), 0.0, LEVELS - 1.001).astype(np.float32)
+    def lookup(self, surface: NDArray[np.int32], u: Float32, v: Float32, octave: Float32) -> Float32:
+        """Albedo (N,) at u, v (N,) metres on the tiles ``surface`` (N,) or (1,), averaged over 2**octave (N,) metres."""
+        level = np.clip(octave - np.float32(np.log2(TEXEL_METRES)), 0.0, LEVELS - 1.001).astype(np.float32)
         lower = level.astype(np.int32)
-        blend = level - lower
-        base = surface * self._offsets[-1]
-        fine = self._bilinear(base, lower, u, v)
-        return fine + blend * (self._bilinear(base, lower + 1, u, v) - fine)
+        u = u * np.float32(1 / TILE_METRES)
+        v = v * np.float32(1 / TILE_METRES)
+        u -= np.floor(u)
+        v -= np.floor(v)
+        entry = surface * LEVELS + lower
+        fine = self._bilinear(entry, lower, u, v)
+        coarse = self._bilinear(entry + 1, lower + 1, u, v)
+        coarse -= fine
+        coarse *= level - lower
+        fine += coarse
+        return fine
 
-    def _bilinear(self, base: NDArray[np.int32], level: NDArray[np.int32], u: Float32, v: Float32) -> Float32:
-        scale = np.float32(1 / TEXEL_METRES) * np.exp2(-level.astype(np.float32))
-        x, y = u * scale - np.float32(0.5), v * scale - np.float32(0.5)
-        floor_x, floor_y = np.floor(x), np.floor(y)
-        fx, fy = x - floor_x, y - floor_y
-        mask = (TILE_TEXELS >> level) - 1
-        shift = (LEVELS - 1) - level
-        start = base + self._offsets[level]
-        x0, y0 = floor_x.astype(np.int32), floor_y.astype(np.int32)
-        x1, y1 = (x0 + 1) & mask, start + (((y0 + 1) & mask) << shift)
-        x0, y0 = x0 & mask, start + ((y0 & mask) << shift)
-        values = self._values
-        top = values[y0 + x0]
-        top += fx * (values[y0 + x1] - top)
-        bottom = values[y1 + x0]
-        bottom += fx * (values[y1 + x1] - bottom)
-        return np.asarray(top + fy * (bottom - top), np.float32)
+    def _bilinear(self, entry: NDArray[np.int32], level: NDArray[np.int32], u: Float32, v: Float32) -> Float32:
+        """Values at fractions u, v of the tile's period, from one level of the pyramid."""
+        size = self._sizes[level]
+        columns = self._columns[entry] + size * u
+        rows = self._rows[entry] + size * v
+        # remap takes images whose sides are below 2^15: fold the samples into rows of a thousand.
+        count, fold = len(u), 1024
+        padded = max(-(-count // fold), 1) * fold
+        maps = np.zeros((2, padded), np.float32)
+        maps[0, :count], maps[1, :count] = columns, rows
+        maps = maps.reshape(2, -1, fold)
+        return np.asarray(cv2.remap(self._image, maps[0], maps[1], cv2.INTER_LINEAR), np.float32).ravel()[:count]
 
 
 @cache

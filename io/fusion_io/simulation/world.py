@@ -12,34 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_io.records import FloatArray
-from fusion_io.simulation.street import (
-    GROUND_CELL_METRES,
-    GroundMap,
-    Look,
-    Path,
-    Polygons,
-    build_ground,
-    build_street,
-)
+from fusion_io.simulation.ground import CELL_METRES, GroundMap, build_ground
+from fusion_io.simulation.street import Look, Path, Polygons, build_street
 from fusion_io.simulation.textures import Float32, Surface, library
 
 VIEW_METRES = 120.0  # nothing further away is drawn
 INDEX_METRES = 32.0
+SLANT_SHARE = 0.8  # how much of the slant's lengthening (in octaves) goes into a sample's footprint
+PATCHES = np.array([Surface.PATCHES], np.int32)
 TENT = np.array([0.25, 0.5, 0.25], np.float32)  # the pixel's filter over samples half a pixel apart
 
 
 class World:
     """A street along a path, fixed by seed and place."""
 
-    def __init__(self, seed: int, ground_path: FloatArray, look: Look | None = None) -> None:
-        """ground_path (N, 3): the ground under the camera along its way, metres, z up."""
+    def __init__(self, seed: int, path: Path, look: Look | None = None) -> None:
+        """path: where the camera passes; look: drawn from the seed unless given."""
         self.look = look or Look.draw(np.random.default_rng([seed, 1]))
         self._offset = np.random.default_rng([seed, 2]).uniform(0, 100, 2).astype(np.float32)
-        self._tones = np.exp(np.random.default_rng([seed, 3]).normal(0, 0.2, 4)).astype(np.float32)
-        path = Path(ground_path)
+        self._tones = np.exp(np.random.default_rng([seed, 3]).normal(0, 0.2, 3)).astype(np.float32)
         street, shadows = build_street(path, self.look, seed)
         self._ground_map = GroundMap(path, shadows)
-        self._polygons = _concatenate([build_ground(path, self.look), street])
+        self._polygons = Polygons.joined([build_ground(path), street])
         self._index = _index_by_place(self._polygons)
 
     def render(
@@ -75,78 +69,80 @@ class World:
 
     def _shade(self, view: _View, hits: NDArray[np.int32], inverse_depth: Float32, K: FloatArray, colour: bool) -> Float32:
         """Radiance of every sample: the surface's albedo at the ray's end times its tint and light."""
+        channels = 3 if colour else 1
         height, width = hits.shape
-        rays = view.rays(K, width, height)
-        radiance = self._sky(rays, view.rotation)
-        hit = hits >= 0
-        index = hits[hit]
-        ray = rays[hit]
-        z = 1.0 / inverse_depth[hit]
-        place = view.texture_coordinates(index, ray, z)
-        # The footprint of a sample: z/f across, and longer by 1/cos along the slant. Between the
-        # two, nearer the long one: the supersampling takes care of the rest.
-        across = z / np.float32(K[0, 0])
-        slant = view.slant(index, ray)
-        albedo_surface = view.surfaces[index]
-        light = view.tints[index] if colour else view.tints[index].mean(axis=1, keepdims=True)
-        ground = view.is_ground[index]
-        if ground.any():
-            tone, surface = self._ground(view, ray[ground], z[ground], across[ground], slant[ground])
-            albedo_surface[ground] = surface
-            light = light.copy()
-            light[ground] *= tone[:, None]
-        footprint = across * np.exp2(np.float32(0.7) * np.log2(slant))
-        albedo = library().lookup(albedo_surface, place[:, 0], place[:, 1], footprint)
-        samples = albedo[:, None] * light
-        out = np.empty((height, width, samples.shape[1]), np.float32)
-        out[...] = radiance[..., None]
-        out[hit] = samples
-        return out if colour else out[..., 0]
+        flat = hits.ravel()
+        pixels = np.flatnonzero(flat >= 0)
+        polygon = flat[pixels]
+        inverse = inverse_depth.ravel()[pixels]
+        u, v = view.texture_coordinates(K, width, pixels, polygon, inverse)
+        # The footprint of a sample is z/f across the view and longer by the slant 1/cos along it. A
+        # value between the two, nearer the long one, blurs little and leaves little to alias.
+        across = -np.log2(inverse) - np.float32(np.log2(K[0, 0]))
+        slant = _log_ray_lengths(K, width, height)[pixels] - view.log_distances[polygon] - np.log2(inverse)
+        light = (view.tints if colour else view.grey_tints)[polygon]
+        surface = view.surfaces[polygon]
+        on_ground = np.flatnonzero(view.is_ground[polygon])
+        if len(on_ground):
+            tone, surface[on_ground] = self._ground(u[on_ground], v[on_ground], across[on_ground], slant[on_ground])
+            light[on_ground] *= tone[:, None]
+        octave = across + np.float32(SLANT_SHARE) * slant - view.log_scales[polygon]
+        light *= library().lookup(surface, u, v, octave)[:, None]
+        radiance = np.empty((height * width, channels), np.float32)
+        radiance[pixels] = light
+        sky = np.flatnonzero(flat < 0)
+        radiance[sky] = self._sky(_rays(K, width, sky) @ view.rotation.T.astype(np.float32))[:, None]
+        return radiance.reshape((height, width, 3) if colour else (height, width))
 
-    def _ground(self, view: _View, ray: Float32, z: Float32, across: Float32, slant: Float32) -> tuple[Float32, NDArray[np.int32]]:
-        """Tone (N,) and surface (N,) of samples on the ground."""
+    def _ground(self, x: Float32, y: Float32, across: Float32, slant: Float32) -> tuple[Float32, NDArray[np.int32]]:
+        """Tone (N,) and surface (N,) at ground points; across and slant are the footprint's log2."""
         look = self.look
-        xy = view.ground_points(ray, z)
-        x, y = xy[:, 0], xy[:, 1]
         lateral, along, sunlight = self._ground_map.lookup(x, y)
         on_road = (lateral < look.road_left_m) & (lateral > -look.road_right_m)
         on_paving = (lateral < look.road_left_m + look.paving_m) & (lateral > -look.road_right_m - look.paving_m)
-        surface = np.where(on_road, Surface.ASPHALT, np.where(on_paving, Surface.PAVING, Surface.GRASS)).astype(np.int32)
-        tone = np.choose(surface, [self._tones[0], self._tones[1], self._tones[2]])
-        patches = library().lookup(
-            np.full(len(x), Surface.PATCHES, np.int32),
-            (x + self._offset[0]) / 4,
-            (y + self._offset[1]) / 4,
-            across * slant / 4,
-        )
-        tone *= 0.5 + patches
-        kerb = _stripe(lateral - look.road_left_m, 0.07, across) + _stripe(lateral + look.road_right_m, 0.07, across)
+        surface = np.full(len(x), Surface.GRASS, np.int32)
+        surface[on_paving] = Surface.PAVING
+        surface[on_road] = Surface.ASPHALT
+        tone = self._tones[surface]
+        x, y = (x + self._offset[0]) * np.float32(0.25), (y + self._offset[1]) * np.float32(0.25)
+        tone *= 0.5 + library().lookup(PATCHES, x, y, across + slant - 2)
+        width, length = np.exp2(across), np.exp2(across + slant)
+        kerb = _stripe(lateral - look.road_left_m, 0.07, width) + _stripe(lateral + look.road_right_m, 0.07, width)
         paint = 0.8 * kerb
         if look.markings:
-            dash = np.clip((1.5 - np.abs(np.mod(along, 9.0) - 4.5)) / (across * slant) + 0.5, 0.0, 1.0)
+            dash = np.clip((1.5 - np.abs(np.mod(along, 9.0) - 4.5)) / length + 0.5, 0.0, 1.0)
             centre = 0.5 * (look.road_left_m - look.road_right_m)
-            paint += 1.2 * dash * _stripe(lateral - centre, 0.07, across)
-            paint += 1.2 * _stripe(lateral + look.road_right_m - 0.35, 0.06, across)
+            paint += 1.2 * dash * _stripe(lateral - centre, 0.07, width)
+            paint += 1.2 * _stripe(lateral + look.road_right_m - 0.35, 0.06, width)
         tone *= 1.0 + paint
         tone *= look.ambient + (1.0 - look.ambient) * look.sun[2] * sunlight
-        return tone.astype(np.float32), surface
+        return tone, surface
 
-    def _sky(self, rays: Float32, rotation: FloatArray) -> Float32:
-        """A bright gradient with clouds, and haze below the horizon; at infinity."""
-        world = rays @ rotation.T.astype(np.float32)
-        norm = np.linalg.norm(world, axis=2)
-        up = world[..., 2] / norm
+    def _sky(self, rays: Float32) -> Float32:
+        """Radiance (N,) of world rays (N, 3): a bright gradient with clouds, haze below the horizon; at infinity."""
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        up = rays[:, 2]
         above = np.maximum(up, 0.02)
-        cloud = library().lookup(
-            np.full(up.size, Surface.PATCHES, np.int32),
-            (world[..., 0] / norm / (above + 0.3)).ravel() * 6,
-            (world[..., 1] / norm / (above + 0.3)).ravel() * 6,
-            np.full(up.size, 0.1, np.float32),
-        ).reshape(up.shape)
+        spread = 6.0 / (above + 0.3)
+        octave = np.full(len(up), -3.0, np.float32)
+        cloud = library().lookup(PATCHES, rays[:, 0] * spread, rays[:, 1] * spread, octave)
         sky = np.float32(self.look.sky) * (1.0 - 0.5 * above) + 0.4 * (cloud - 0.5)
         haze = np.float32(0.35 * self.look.sky)
-        blend = np.clip(up / 0.02 + 0.5, 0.0, 1.0)
-        return np.asarray(haze + blend * (sky - haze), np.float32)
+        return np.asarray(haze + np.clip(up / 0.02 + 0.5, 0.0, 1.0) * (sky - haze), np.float32)
+
+
+def _rays(K: FloatArray, width: int, pixels: NDArray[np.int64]) -> Float32:
+    """Rays (N, 3) of flat pixel indices in camera axes, with z = 1."""
+    row, column = np.divmod(pixels, width)
+    x, y = (column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]
+    return np.column_stack([x, y, np.ones(len(pixels))]).astype(np.float32)
+
+
+def _log_ray_lengths(K: FloatArray, width: int, height: int) -> Float32:
+    """log2 of the length of every pixel's ray with z = 1, flat."""
+    x, y = (np.arange(width) - K[0, 2]) / K[0, 0], (np.arange(height) - K[1, 2]) / K[1, 1]
+    square = (1.0 + x * x).astype(np.float32) + (y * y).astype(np.float32)[:, None]
+    return np.asarray(0.5 * np.log2(square).ravel())
 
 
 class _View:
@@ -165,105 +161,113 @@ class _View:
         first = polygons.corners[candidates, 0] - self.position
         facing = np.einsum("ij,ij->i", polygons.normals[candidates], first) < -1e-6
         facing &= np.einsum("ij,ij->i", first, first) < VIEW_METRES**2
-        facing &= first @ self.rotation[:, 2] > -GROUND_CELL_METRES * 2
+        facing &= first @ self.rotation[:, 2] > -2 * CELL_METRES
         candidates = candidates[facing]
         corners = (polygons.corners[candidates] - self.position) @ self.rotation
         # A polygon is out of sight if all its corners are outside of one side of the view's pyramid.
         sides = np.array([[1, 0, 1], [-1, 0, width], [0, 1, 1], [0, -1, height], [0, 0, 1]]) @ K
         outside = corners @ sides.T < 0
         seen = ~outside.all(axis=1).any(axis=1)
+        # Nor is it if it is smaller than a pixel's half, but for the ground, where holes would show.
+        distance = np.linalg.norm(corners, axis=2).min(axis=1)
+        extent = np.ptp(corners, axis=1).max(axis=1)
+        seen &= (extent * K[0, 0] > 0.7 * distance) | polygons.is_ground[candidates]
+        seen = np.flatnonzero(seen)
+        seen = seen[np.argsort(distance[seen], kind="stable")]  # near ones first: they hide the rest
         candidates, corners = candidates[seen], corners[seen]
         self._corners = corners
         self._normals = polygons.normals[candidates] @ self.rotation
         self._distances = np.einsum("ij,ij->i", self._normals, corners[:, 0])
-        axes = polygons.axes[candidates]
-        start = np.einsum("ij,ikj->ik", self.position - polygons.origins[candidates], axes)
-        self._texture_axes = (axes @ self.rotation).astype(np.float32)
-        self._texture_start = (start + polygons.shifts[candidates]).astype(np.float32)
-        self._unit = (self._normals / self._distances[:, None]).astype(np.float32)
-        self._normals32 = self._normals.astype(np.float32)
+        self._axes = polygons.axes[candidates] @ self.rotation
+        arm = self.position - polygons.corners[candidates, 0]
+        self._starts = np.einsum("fj,fkj->fk", arm, polygons.axes[candidates]) + polygons.shifts[candidates]
+        self.log_distances = np.log2(-self._distances).astype(np.float32)
+        self.log_scales = -np.log2(np.linalg.norm(polygons.axes[candidates, 0], axis=1)).astype(np.float32)
         self.surfaces = polygons.surfaces[candidates]
         self.tints = polygons.tints[candidates].astype(np.float32)
+        self.grey_tints = self.tints.mean(axis=1, keepdims=True)
         self.is_ground = polygons.is_ground[candidates]
-
-    @staticmethod
-    def rays(K: FloatArray, width: int, height: int) -> Float32:
-        """(H, W, 3) rays in camera axes with z = 1."""
-        rays = np.ones((height, width, 3), np.float32)
-        rays[..., 0] = (np.arange(width) - K[0, 2]) / K[0, 0]
-        rays[..., 1] = ((np.arange(height) - K[1, 2]) / K[1, 1])[:, None]
-        return rays
 
     def cast(self, K: FloatArray, width: int, height: int) -> tuple[NDArray[np.int32], Float32]:
         """The polygon (H, W) that every ray meets first, -1 for none, and its inverse depth, 0 for none."""
         hits = np.full((height, width), -1, np.int32)
         nearest = np.zeros((height, width), np.float32)
         pixel_from_normal = np.linalg.inv(K)  # n.K^-1 (u, v, 1) = (n K^-1).(u, v, 1)
-        edges = np.cross(self._corners, np.roll(self._corners, -1, axis=1)) @ pixel_from_normal
-        planes = (self._normals / self._distances[:, None]) @ pixel_from_normal
-        left, right = _spans(edges, self._corners.mean(axis=1), K, width, height)
+        left, right = self._spans(K, width, height)
         filled = left < right
-        rows = np.arange(height)
         some = np.flatnonzero(filled.any(axis=1))
-        top = filled[some].argmax(axis=1)
-        bottom = height - filled[some, ::-1].argmax(axis=1)
-        first = np.where(filled, left, width)[some].min(axis=1)
-        last = np.where(filled, right, 0)[some].max(axis=1)
-        columns = np.arange(width, dtype=np.float32)
-        whole = np.arange(width, dtype=np.int32)
-        a, b, c = planes[some].astype(np.float32).T
-        for polygon, r0, r1, c0, c1, pa, pb, pc in zip(some, top, bottom, first, last, a, b, c, strict=True):
-            inverse = (pb * rows[r0:r1].astype(np.float32) + pc)[:, None] + pa * columns[c0:c1]
+        filled, left, right = filled[some], left[some], right[some]
+        top = filled.argmax(axis=1)
+        bottom = height - filled[:, ::-1].argmax(axis=1)
+        first = np.where(filled, left, width).min(axis=1)
+        last = np.where(filled, right, 0).max(axis=1)
+        a, b, c = ((self._normals[some] / self._distances[some, None]) @ pixel_from_normal).T
+        by_row = (b[:, None] * np.arange(height) + c[:, None]).astype(np.float32)[..., None]
+        by_column = (a[:, None] * np.arange(width)).astype(np.float32)
+        columns = np.arange(width, dtype=np.int32)
+        start, length = left[..., None], np.maximum(right - left, 0).astype(np.uint32)[..., None]
+        for i, (polygon, r0, r1, c0, c1) in enumerate(
+            zip(some.tolist(), top.tolist(), bottom.tolist(), first.tolist(), last.tolist(), strict=True)
+        ):
+            inverse = by_row[i, r0:r1] + by_column[i, c0:c1]
             window = nearest[r0:r1, c0:c1]
             inside = inverse > window
-            inside &= whole[c0:c1] >= left[polygon, r0:r1, None]
-            inside &= whole[c0:c1] < right[polygon, r0:r1, None]
+            if not inside.any():
+                continue
+            # 0 <= column - start < length in one comparison, as a negative number is a huge unsigned one.
+            inside &= (columns[c0:c1] - start[i, r0:r1]).view(np.uint32) < length[i, r0:r1]
             np.copyto(window, inverse, where=inside)
-            np.copyto(hits[r0:r1, c0:c1], np.int32(polygon), where=inside)
+            np.copyto(hits[r0:r1, c0:c1], polygon, where=inside)
         return hits, nearest
 
-    def texture_coordinates(self, index: NDArray[np.int32], ray: Float32, z: Float32) -> Float32:
-        """(N, 2) metres on the tile."""
-        axes = self._texture_axes[index]
-        return np.asarray(np.einsum("nkj,nj->nk", axes, ray * z[:, None]) + self._texture_start[index])
+    def _spans(self, K: FloatArray, width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The columns [left, right) of every row, each (F, H), that lie inside all edges of each polygon.
 
-    def slant(self, index: NDArray[np.int32], ray: Float32) -> Float32:
-        """1 / cos of the angle of incidence, (N,)."""
-        cosine = -np.einsum("nj,nj->n", self._normals32[index], ray)
-        return np.asarray(np.linalg.norm(ray, axis=1) / np.maximum(cosine, 1e-3), np.float32)
+        An edge's plane through the camera bounds the column by a line in the row. Two polygons that
+        share an edge find the same line to the bit, so no sample falls between them.
+        """
+        normals = np.cross(self._corners, np.roll(self._corners, -1, axis=1))
+        edges = normals @ np.linalg.inv(K)
+        inner = np.sign(np.einsum("fej,fj->fe", normals, self._corners.mean(axis=1)))
+        a, b, c = np.moveaxis(edges, 2, 0)
+        a = np.where(np.abs(a) < 1e-12 * np.abs(c), 1e-12 * np.abs(c) + 1e-150, a)  # level edges bound the rows
+        a[a == 0] = 1.0  # the padding's edges have no length: they bound nothing
+        slope, offset = -b / a, -c / a
+        is_left, is_right = inner * a > 0, inner * a < 0
+        rows = np.arange(height)
+        left = np.zeros((len(a), height))
+        right = np.full((len(a), height), width - 1.0)
+        for edge in range(a.shape[1]):
+            line = slope[:, edge, None] * rows + offset[:, edge, None]
+            np.maximum(left, line, out=left, where=is_left[:, edge, None])
+            np.minimum(right, line, out=right, where=is_right[:, edge, None])
+        first = np.ceil(np.minimum(left, width)).astype(np.int32)
+        return first, np.floor(np.maximum(right, -1.0)).astype(np.int32) + 1
 
-    def ground_points(self, ray: Float32, z: Float32) -> Float32:
-        """World x, y (N, 2) of the rays' ends."""
-        return np.asarray((ray * z[:, None]) @ self.rotation[:2].T.astype(np.float32) + self.position[:2].astype(np.float32))
+    def texture_coordinates(
+        self, K: FloatArray, width: int, pixels: NDArray[np.int64], polygon: NDArray[np.int32], inverse: Float32
+    ) -> tuple[Float32, Float32]:
+        """u and v, each (N,), in metres on the tile, of flat pixels that see the polygons (N,)."""
+        row, column = np.divmod(pixels.astype(np.int32), np.int32(width))
+        row, column = row.astype(np.float32), column.astype(np.float32)
+        per_pixel = (self._axes @ np.linalg.inv(K)).astype(np.float32)
+        starts = self._starts.astype(np.float32)
 
+        def along(axis: int) -> Float32:
+            value = per_pixel[:, axis, 0][polygon] * column
+            value += per_pixel[:, axis, 1][polygon] * row
+            value += per_pixel[:, axis, 2][polygon]
+            value /= inverse
+            value += starts[:, axis][polygon]
+            return value
 
-def _spans(
-    edges: FloatArray, centres: FloatArray, K: FloatArray, width: int, height: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The columns [left, right) of every row (F, H) that lie inside all edges (F, 5, 3) of each polygon."""
-    centre_pixels = centres @ K.T
-    sign = np.sign(np.einsum("fej,fj->fe", edges, centre_pixels))
-    a, b, c = np.moveaxis((edges * sign[..., None]).astype(np.float32), 2, 0)
-    rest = b[..., None] * np.arange(height, dtype=np.float32) + c[..., None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bound = -rest / a[..., None]
-    left = np.where(a[..., None] > 0, bound, np.float32(0)).max(axis=1)
-    right = np.where(a[..., None] < 0, bound, np.float32(width - 1)).min(axis=1)
-    empty = ((a[..., None] == 0) & (rest < 0)).any(axis=1)
-    first = np.ceil(np.clip(left, 0, width)).astype(np.int32)
-    last = np.floor(np.clip(right, -1, width - 1)).astype(np.int32) + 1
-    last[empty] = 0
-    return first, last
+        return along(0), along(1)
 
 
 def _stripe(offset: Float32, half_width: float, footprint: Float32) -> Float32:
     """Coverage of a stripe seen through a box of the footprint's width."""
     upper = np.clip((offset + half_width) / footprint + 0.5, 0.0, 1.0)
     return np.asarray(upper - np.clip((offset - half_width) / footprint + 0.5, 0.0, 1.0))
-
-
-def _concatenate(parts: list[Polygons]) -> Polygons:
-    return Polygons(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in Polygons.__annotations__})
 
 
 def _index_by_place(polygons: Polygons) -> dict[tuple[int, int], NDArray[np.int64]]:

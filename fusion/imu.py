@@ -1,0 +1,398 @@
+"""How the IMU is mounted and what its clock reads, from the log alone; and the IMU in the camera's axes and time.
+
+Gyro and pair estimates see the same turning. With v_imu = R_imu_camera v_camera, t_imu = t_camera + offset and a gyro
+bias b, the rotation vectors of one interval dt obey
+
+    turned_camera = R_imu_camera^T (turned_imu(offset) - b dt) + e                                                  (1)
+
+The offset is found by correlating angular rates, which needs no mounting; then the mounting is Wahba's problem, in
+closed form; then mounting, bias and offset are refined together on (1) by robust Gauss-Newton. The errors e of odometry
+are correlated in time, so they are whitened by an autoregressive model that is fitted to them (generalised least
+squares): that makes the estimates efficient and their standard deviations honest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import binary_closing, binary_opening, find_objects, label
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation, Slerp
+
+from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate
+
+# The search for the time offset, and how well angular rates must correlate where it is right.
+MAX_TIME_OFFSET_S = 0.5
+TIME_OFFSET_STEP_S = 0.005
+MIN_CORRELATION = 0.5
+
+# What a log must show before its IMU is used.
+MIN_PAIRS = 40  # that the IMU measured from start to end
+MIN_COVERAGE = 0.5  # their share of all pairs
+MIN_EXPLAINED = 0.5  # share of the pairs' turning (as variance) that the gyro explains
+MIN_EXPLAINED_GIVEN = -0.1  # the same with a given mounting: on a straight road there is nothing to explain
+MAX_SCALE_ERROR = 0.03  # of the gyro against the pairs
+MAX_ROTATION_STD_RAD = float(np.deg2rad(2.0))
+MAX_TIME_OFFSET_STD_S = 0.02
+GRAVITY_RANGE = (8.8, 10.8)  # m/s^2, for the median magnitude that the accelerometer shows
+MAX_FAULTY_SHARE = 0.2
+
+# Where gyro and pairs disagree for long, the gyro is at fault: front ends fail for single pairs, but an IMU that
+# stalled, saturated, or was filled in by interpolation did so for a while.
+CONTRADICTION = 8.0  # standard deviations
+CONTRADICTION_PAIRS = 4  # at least so many in a row
+CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
+
+# An IMU has a hole where samples are further apart than this many of its periods.
+HOLE_PERIODS = 5.0
+
+# Weak priors of the refinement: they keep it solvable where the motion leaves something open.
+ROTATION_PRIOR_RAD = 0.5
+GYRO_BIAS_PRIOR = 0.1  # rad/s
+TIME_OFFSET_PRIOR_S = 0.1
+
+WHITENING_ORDER = 5
+CAUCHY = 2.385  # standard deviations; 95 % efficient on Gaussian errors (Holland and Welsch, 1977)
+MAD_TO_STD = 1.4826
+ITERATIONS = 30
+CONVERGED = 1e-9
+
+ROTATION, BIAS, OFFSET = slice(0, 3), slice(3, 6), slice(6, 7)  # of the parameters of (1)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuCalibration:
+    """How an IMU relates to the camera, and whether it is used.
+
+    rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
+    gyro_bias (3,) rad/s in IMU axes, as the pairs see it. used, reason: the verdict and what led to it.
+    rotation_std_rad (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (3,): standard deviations, zero for
+    what was given. faulty_ns (M, 2): intervals on the IMU's clock in which the gyro contradicts the pairs for long.
+    """
+
+    rotation_imu_camera: Rotation | None
+    time_offset_s: float
+    gyro_bias: FloatArray
+    used: bool
+    reason: str
+    rotation_std_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
+    time_offset_std_s: float = 0.0
+    gyro_bias_std: FloatArray = field(default_factory=lambda: np.zeros(3))
+    faulty_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+
+
+def calibrate(
+    pairs: Sequence[PairEstimate], imu: ImuSeries, rotation: Rotation | None, time_offset_s: float | None
+) -> ImuCalibration:
+    """Mounting rotation, time offset and gyro bias from pair estimates and the IMU; None means: to be estimated.
+
+    Bad data is no error: an IMU that cannot be used with confidence is left out, and the reason says why.
+    """
+
+    def left_out(reason: str) -> ImuCalibration:
+        return ImuCalibration(rotation, time_offset_s or 0.0, np.zeros(3), False, reason)
+
+    problem = _sensor_problem(imu)
+    if problem:
+        return left_out(problem)
+    gyro, turns = _Gyro(imu), _turns(pairs, int(imu.stamps_ns[0]))
+    offset_s, correlation = _correlate(gyro, turns) if time_offset_s is None else (time_offset_s, 1.0)
+    covered = gyro.measured(turns.source_s + offset_s, turns.target_s + offset_s)
+    if covered.sum() < MIN_PAIRS:
+        return left_out(f"it measured {covered.sum()} pairs from start to end, and {MIN_PAIRS} are needed")
+    if covered.mean() < MIN_COVERAGE:
+        return left_out(f"it measured only {covered.mean():.0%} of the pairs")
+    if correlation < MIN_CORRELATION:
+        return left_out(f"its angular rates do not follow those of the pairs (correlation {correlation:.2f} at best)")
+
+    fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
+    problem = _fit_problem(fit)
+    return ImuCalibration(
+        fit.rotation_imu_camera,
+        fit.time_offset_s,
+        fit.gyro_bias,
+        used=problem is None,
+        reason=problem or _summary(fit),
+        rotation_std_rad=fit.std[ROTATION],
+        time_offset_std_s=float(fit.std[OFFSET][0]),
+        gyro_bias_std=fit.std[BIAS],
+        faulty_ns=fit.faulty_intervals() + imu.stamps_ns[0],
+    )
+
+
+def in_camera_axes(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
+    """The IMU on the camera's clock and in the camera's axes, without faulty stretches. Its biases are not removed.
+
+    Raises ValueError where the mounting is unknown.
+    """
+    if calibration.rotation_imu_camera is None:
+        raise ValueError("the mounting of the IMU is unknown")
+    good = np.ones(len(imu), dtype=bool)
+    for start_ns, end_ns in calibration.faulty_ns:
+        good &= (imu.stamps_ns < start_ns) | (imu.stamps_ns > end_ns)
+    to_camera = calibration.rotation_imu_camera.inv()
+    return ImuSeries(
+        imu.stamps_ns[good] - round(calibration.time_offset_s * NANOSECONDS),
+        to_camera.apply(imu.angular_velocity[good]),
+        to_camera.apply(imu.linear_acceleration[good]),
+        imu.angular_velocity_std,
+        imu.linear_acceleration_std,
+    )
+
+
+# ------------------------------------------------------------------------------------------------ what is compared
+
+
+class _Turns(NamedTuple):
+    """The rotations of N pairs: rotation vectors turned (N, 3) from source_s to target_s (N,), camera clock."""
+
+    source_s: FloatArray
+    target_s: FloatArray
+    turned: FloatArray
+
+    def where(self, mask: NDArray[np.bool_]) -> _Turns:
+        """Those that a mask (N,) chooses."""
+        return _Turns(*(values[mask] for values in self))
+
+
+def _turns(pairs: Sequence[PairEstimate], zero_ns: int) -> _Turns:
+    """The rotations of pair estimates, in seconds since a stamp."""
+    stamps = np.array([(pair.source_stamp_ns, pair.target_stamp_ns) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    quats_wxyz = np.array([pair.quat_wxyz for pair in pairs]).reshape(-1, 4)
+    seconds = (stamps - zero_ns) / NANOSECONDS
+    return _Turns(seconds[:, 0], seconds[:, 1], Rotation.from_quat(quats_wxyz, scalar_first=True).as_rotvec())
+
+
+class _Gyro:
+    """What the gyro turned over any interval, in seconds since its first sample; rates are linear between samples."""
+
+    def __init__(self, imu: ImuSeries) -> None:
+        self._seconds = (imu.stamps_ns - imu.stamps_ns[0]) / NANOSECONDS
+        self._rates = imu.angular_velocity
+        periods = np.diff(self._seconds)
+        increments = Rotation.from_rotvec((self._rates[1:] + self._rates[:-1]) / 2 * periods[:, None]).as_matrix()
+        orientations = np.stack(list(accumulate(increments, np.matmul, initial=np.eye(3))))
+        self._orientation = Slerp(self._seconds, Rotation.from_matrix(orientations))
+        self._angle = cumulative_trapezoid(np.linalg.norm(self._rates, axis=1), self._seconds, initial=0.0)
+        self._holes = np.concatenate([[0], np.cumsum(periods > HOLE_PERIODS * np.median(periods))])
+
+    def measured(self, start_s: FloatArray, end_s: FloatArray) -> NDArray[np.bool_]:
+        """Which intervals (N,) the samples cover from start to end without a hole."""
+        first = np.searchsorted(self._seconds, start_s, side="right") - 1
+        last = np.searchsorted(self._seconds, end_s)
+        inside = (first >= 0) & (last < len(self._seconds))
+        return np.asarray(inside & (self._holes[first] == self._holes[np.where(inside, last, 0)]))
+
+    def turned(self, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """Rotation vectors (N, 3) of R_start_end."""
+        start, end = (self._orientation(np.clip(at_s, 0.0, self._seconds[-1])) for at_s in (start_s, end_s))
+        return np.asarray((start.inv() * end).as_rotvec())
+
+    def rate(self, at_s: FloatArray) -> FloatArray:
+        """Angular velocity (N, 3)."""
+        return np.stack([np.interp(at_s, self._seconds, axis) for axis in self._rates.T], axis=-1)
+
+    def speed(self, start_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """Mean magnitude (N,) of the angular velocity over intervals."""
+        start, end = (np.interp(at_s, self._seconds, self._angle) for at_s in (start_s, end_s))
+        return np.asarray((end - start) / (end_s - start_s))
+
+
+def _sensor_problem(imu: ImuSeries) -> str | None:
+    """What is wrong with the samples by themselves, or None."""
+    if not len(imu):
+        return "the log has no IMU"
+    for name, values in (("gyro", imu.angular_velocity), ("accelerometer", imu.linear_acceleration)):
+        stuck = np.ptp(values, axis=0) == 0.0
+        if np.any(stuck):
+            return f"its {name} is stuck: {'xyz'[int(np.argmax(stuck))]} never changes"
+    shown = float(np.median(np.linalg.norm(imu.linear_acceleration, axis=1)))
+    if not GRAVITY_RANGE[0] <= shown <= GRAVITY_RANGE[1]:
+        return f"its accelerometer does not show gravity, but {shown:.3g} m/s^2 (median magnitude)"
+    return None
+
+
+# ------------------------------------------------------------------------------------------------------ estimation
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """The solution of (1) over N pairs.
+
+    std (7,): standard deviations of rotation (about the camera's axes), bias and offset, zero for what is given.
+    moved_s: from the offset where the refinement began. predicted (N, 3): turning in camera axes by the gyro.
+    sigma (3,): robust standard deviation of the residual per axis.
+    """
+
+    rotation_imu_camera: Rotation
+    gyro_bias: FloatArray
+    time_offset_s: float
+    std: FloatArray
+    moved_s: float
+    turns: _Turns
+    predicted: FloatArray
+    sigma: FloatArray
+
+    @property
+    def deviation(self) -> FloatArray:
+        """The residual's norm (N,) in standard deviations."""
+        return np.asarray(np.linalg.norm((self.turns.turned - self.predicted) / self.sigma, axis=1))
+
+    @property
+    def faulty(self) -> NDArray[np.bool_]:
+        """Pairs (N,) of the stretches in which gyro and pairs contradict each other for long."""
+        lasting = binary_opening(self.deviation > CONTRADICTION, np.ones(CONTRADICTION_PAIRS))
+        return np.asarray(binary_closing(lasting, np.ones(CONTRADICTION_PAUSE)) | lasting)
+
+    def faulty_intervals(self) -> IntArray:
+        """The stretches as intervals (M, 2) in nanoseconds of the IMU's clock since its first sample."""
+        runs = [run[0] for run in find_objects(label(self.faulty)[0])]
+        ends = [(self.turns.source_s[run][0], self.turns.target_s[run][-1]) for run in runs]
+        seconds = np.array(ends).reshape(-1, 2) + self.time_offset_s
+        return np.round(seconds * NANOSECONDS).astype(np.int64)
+
+    @property
+    def explained(self) -> float:
+        """Share of the pairs' turning (about its mean) that the gyro explains; outliers count little."""
+        weight = 1.0 / (1.0 + (self.deviation / CAUCHY) ** 2)[:, None]
+        turned = self.turns.turned - np.average(self.turns.turned, axis=0, weights=weight[:, 0])
+        unexplained = np.sum(weight * (self.turns.turned - self.predicted) ** 2)
+        return float(1.0 - unexplained / np.sum(weight * turned**2))
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """The pairs' turning as a multiple of the gyro's, and its standard deviation: a median over the quicker half."""
+        square = np.sum(self.predicted**2, axis=1)
+        quick = square >= np.median(square)
+        ratio = np.sum(self.predicted * self.turns.turned, axis=1)[quick] / square[quick]
+        median = np.median(ratio)
+        std = 1.25 * MAD_TO_STD * np.median(np.abs(ratio - median)) / np.sqrt(len(ratio))
+        return float(median), float(std)
+
+
+def _correlate(gyro: _Gyro, turns: _Turns) -> tuple[float, float]:
+    """The time offset at which the magnitudes of the angular rates correlate best, and that correlation."""
+    offset_s, highest = 0.0, 0.0
+    speed = np.linalg.norm(turns.turned, axis=1) / (turns.target_s - turns.source_s)
+    for candidate_s in np.arange(-MAX_TIME_OFFSET_S, MAX_TIME_OFFSET_S + TIME_OFFSET_STEP_S / 2, TIME_OFFSET_STEP_S):
+        start_s, end_s = turns.source_s + candidate_s, turns.target_s + candidate_s
+        covered = gyro.measured(start_s, end_s)
+        if covered.sum() < MIN_PAIRS:
+            continue
+        speeds = np.stack([speed[covered], gyro.speed(start_s[covered], end_s[covered])])
+        if np.all(np.ptp(speeds, axis=1) > 0.0):
+            correlation = float(np.corrcoef(speeds)[0, 1])
+            if correlation > highest:
+                offset_s, highest = float(candidate_s), correlation
+    return offset_s, highest
+
+
+def _wahba(gyro_turned: FloatArray, turned: FloatArray) -> Rotation:
+    """R_imu_camera that best turns the rotation vectors (N, 3) of the pairs into those of the gyro, in closed form.
+
+    A constant bias drops out by centring. Pairs whose two angles differ, whatever the mounting, count little.
+    """
+    difference = np.linalg.norm(gyro_turned, axis=1) - np.linalg.norm(turned, axis=1)
+    scale = CAUCHY * MAD_TO_STD * np.median(np.abs(difference - np.median(difference)))
+    weight = 1.0 / (1.0 + ((difference - np.median(difference)) / scale) ** 2)
+    centred = [values - np.average(values, axis=0, weights=weight) for values in (gyro_turned, turned)]
+    rotation, _ = Rotation.align_vectors(*centred, weights=weight)
+    return rotation
+
+
+def _refine(gyro: _Gyro, turns: _Turns, rotation: Rotation | None, offset_s: float, *, estimate_offset: bool) -> _Fit:
+    """Robust generalised least squares on (1), with weak priors; rotation None is estimated from the closed form."""
+    source_s, target_s, turned = turns
+    seconds = (target_s - source_s)[:, None]
+    start = rotation or _wahba(gyro.turned(source_s + offset_s, target_s + offset_s), turned)
+    free = np.repeat([rotation is None, True, estimate_offset], [3, 3, 1])
+    prior_std = np.repeat([ROTATION_PRIOR_RAD, GYRO_BIAS_PRIOR, TIME_OFFSET_PRIOR_S], [3, 3, 1])
+    solution, covariance = np.zeros(7), np.zeros((7, 7))  # the solution is relative to the start
+    to_camera = start.inv()
+    for _ in range(ITERATIONS):
+        from_s, to_s = source_s + offset_s + solution[6], target_s + offset_s + solution[6]
+        predicted = to_camera.apply(gyro.turned(from_s, to_s) - solution[BIAS] * seconds)
+        by_rotation = np.cross(np.eye(3), predicted[:, None, :]).swapaxes(1, 2)  # d/dx Exp(x) p = -[p]
+        by_bias = -seconds[:, :, None] * to_camera.as_matrix()
+        by_offset = to_camera.apply(gyro.rate(to_s) - gyro.rate(from_s))[:, :, None]
+        jacobian = np.concatenate([by_rotation, by_bias, by_offset], axis=2)[:, :, free]
+        residual, jacobian = _whitened(turned - predicted, jacobian)
+
+        weight = 1.0 / (1.0 + (residual / CAUCHY) ** 2)
+        information = np.einsum("nai,na,naj->ij", jacobian, weight, jacobian) + np.diag(prior_std[free] ** -2.0)
+        gradient = np.einsum("nai,na,na->i", jacobian, weight, residual) - solution[free] / prior_std[free] ** 2
+        covariance[np.ix_(free, free)] = np.linalg.inv(information)
+        step = covariance[:, free] @ gradient
+        solution += step
+        to_camera = Rotation.from_rotvec(step[ROTATION]) * to_camera
+        if np.all(np.abs(step) <= CONVERGED):
+            break
+    return _Fit(
+        rotation_imu_camera=to_camera.inv(),
+        gyro_bias=solution[BIAS],
+        time_offset_s=float(offset_s + solution[6]),
+        std=np.sqrt(np.diag(covariance)),
+        moved_s=float(solution[6]),
+        turns=turns,
+        predicted=predicted,
+        sigma=_robust_std(turned - predicted),
+    )
+
+
+def _whitened(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residual (N, 3) and Jacobian (N, 3, M) filtered so that the residual is white with unit variance, per axis."""
+    white, white_jacobian = np.empty_like(residual), np.empty_like(jacobian)
+    for axis in range(3):
+        taps = _autoregression(residual[:, axis])
+        white[:, axis] = lfilter(taps, 1.0, residual[:, axis])
+        white_jacobian[:, axis] = lfilter(taps, 1.0, jacobian[:, axis], axis=0)
+    sigma = _robust_std(white)
+    return white / sigma, white_jacobian / sigma[:, None]
+
+
+def _autoregression(errors: FloatArray) -> FloatArray:
+    """The whitening filter (1, -a1, ..., -ap) of the errors (N,), fitted by least squares with outliers clipped."""
+    bound = 3.0 * _robust_std(errors)
+    clipped = np.clip(errors, -bound, bound)
+    past = np.lib.stride_tricks.sliding_window_view(clipped, WHITENING_ORDER)[:-1, ::-1]
+    coefficients, *_ = np.linalg.lstsq(past, clipped[WHITENING_ORDER:])
+    return np.concatenate([[1.0], -coefficients])
+
+
+def _robust_std(values: FloatArray) -> FloatArray:
+    """Standard deviation along the first axis, from the median absolute value; never zero."""
+    return np.asarray(np.maximum(MAD_TO_STD * np.median(np.abs(values), axis=0), np.finfo(float).eps))
+
+
+def _fit_problem(fit: _Fit) -> str | None:
+    """Why a fit does not carry the use of the IMU, or None."""
+    scale, scale_std = fit.scale
+    estimated = fit.std[ROTATION].max() > 0.0
+    rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
+    if fit.faulty.mean() > MAX_FAULTY_SHARE:
+        return f"its gyro contradicts the pairs for {fit.faulty.mean():.0%} of the time"
+    if abs(scale - 1.0) > MAX_SCALE_ERROR + 2.0 * scale_std:
+        return f"its gyro shows {1.0 / scale:.3g} times the turning of the pairs" if scale > 0 else "its gyro is reversed"
+    if fit.explained < (MIN_EXPLAINED if estimated else MIN_EXPLAINED_GIVEN):
+        return f"its gyro explains {max(fit.explained, 0.0):.0%} of the pairs' turning: too little, or too little turning"
+    if rotation_std > MAX_ROTATION_STD_RAD:
+        return f"the motion shows its mounting to no better than {np.rad2deg(rotation_std):.1f} deg"
+    if abs(fit.moved_s) > 2.0 * TIME_OFFSET_PRIOR_S or offset_std > MAX_TIME_OFFSET_STD_S:
+        return f"the motion shows its time offset to no better than {1e3 * max(offset_std, abs(fit.moved_s)):.0f} ms"
+    return None
+
+
+def _summary(fit: _Fit) -> str:
+    """One line on what was estimated, and how well."""
+    rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
+    mounting = f"estimated to {np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
+    offset = f"estimated to {1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
+    faulty = f"; left out in {len(fit.faulty_intervals())} faulty stretches" if fit.faulty.any() else ""
+    explained = f"its gyro explains {fit.explained:.1%} of the turning of {len(fit.predicted)} pairs"
+    return f"{explained}; mounting {mounting}, time offset {offset}{faulty}"

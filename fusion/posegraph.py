@@ -1,0 +1,259 @@
+"""The pose graph back end: pair estimates and preintegrated inertial measurements in one least-squares problem (GTSAM).
+
+Variables are the camera poses in the first camera's frame and, where an IMU measured, velocities, IMU biases and the
+direction of gravity in that frame. The first pose is fixed, so that the marginal covariances are those of the poses
+relative to it. Without an IMU the graph is a chain: its solution is the raw trajectory, its marginals the propagated
+covariances.
+
+Preintegration: Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", 2017. All linear
+systems are solved by QR: Cholesky fails on graphs whose factors differ so much in weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, G, V, X
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+from scipy.stats import chi2
+
+from fusion.chain import ImuWindow, ImuWindows, chain, motions_of, stamps_of
+from fusion.config import PoseGraphConfig
+from fusion_io.errors import LogError
+from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, PairEstimate, Trajectory
+
+GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
+GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first direction of gravity
+FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that the solver suffers
+INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
+BATCHES = 10  # whose means tell how far the errors of pairs are correlated in time
+MIN_WINDOWS = 2 * BATCHES
+MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance is singular but for rounding
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphResult:
+    """The fused trajectory with the marginal covariance of every pose, and what the graph made of the IMU.
+
+    note: one line on how the IMU was used, or why it was not. imu_factors: steps with a preintegrated factor;
+    rejected: steps that the IMU measured, but where its rotation contradicts the pair's beyond noise.
+    """
+
+    trajectory: Trajectory
+    note: str
+    imu_factors: int = 0
+    rejected: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class GyroComparison:
+    """What the rotations of gyro and pairs say of each other.
+
+    bias (3,) rad/s: the mean difference of their rates. bias_sigma: how well the gyro's bias is known to be near zero
+    before it is compared. inflation: the factor on the standard deviation of pair rotations after which sums over
+    time are as uncertain as they are. agrees (N,): steps where the two differ by no more than noise.
+    """
+
+    bias: FloatArray
+    bias_sigma: float
+    inflation: float
+    agrees: NDArray[np.bool_]
+
+
+def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: PoseGraphConfig) -> PoseGraphResult:
+    """The most likely trajectory of N steps given an IMU in the camera's axes and time, or None.
+
+    Where the IMU has holes there is no factor, and its bias walks on. Where it cannot be used the pairs alone are
+    solved, and the note says why. Raises LogError for a step that is no measurement: a rotation or covariance that
+    is not one.
+    """
+    check(steps)
+    if inertial is None:
+        return PoseGraphResult(solve_pairs(steps), "pairs only")
+    windows = _windows(steps, inertial)
+    measured = sum(window is not None for window in windows)
+    if measured < MIN_WINDOWS:
+        return PoseGraphResult(solve_pairs(steps), f"pairs only: the IMU measured {measured} of {len(steps)} steps")
+    gyro = compare_rotations(steps, windows, config)
+    rejected = sum(window is not None for window in windows) - int(gyro.agrees.sum())
+    used = [window if agrees else None for window, agrees in zip(windows, gyro.agrees, strict=True)]
+    try:
+        trajectory = solve_inertial(steps, used, gyro, config)
+    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException
+        reason = " ".join(str(error).split())
+        return PoseGraphResult(solve_pairs(steps), f"pairs only: the graph with the IMU has no solution ({reason})")
+    note = f"IMU factors on {measured - rejected} of {len(steps)} steps"
+    return PoseGraphResult(trajectory, note, measured - rejected, rejected)
+
+
+def check(steps: Sequence[PairEstimate]) -> None:
+    """Refuse, with a LogError, what would end the interpreter or never converge inside GTSAM."""
+    quats = np.stack([step.quat_wxyz for step in steps])
+    translations = np.stack([step.translation for step in steps])
+    covariances = np.stack([step.covariance for step in steps])
+    _refuse(steps, ~np.isfinite(np.hstack([quats, translations])).all(axis=1), "its pose is not finite")
+    _refuse(steps, abs(np.linalg.norm(quats, axis=1) - 1.0) > 1e-3, "its rotation is not a unit quaternion")
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    finite = np.isfinite(covariances).all(axis=(1, 2)) & (variances > 0.0).all(axis=1)
+    _refuse(steps, ~finite, "its covariance has variances that are not finite and positive")
+    sigmas = np.sqrt(variances)
+    correlations = covariances / (sigmas[:, :, None] * sigmas[:, None, :])
+    symmetric = np.isclose(correlations, correlations.swapaxes(1, 2)).all(axis=(1, 2))
+    definite = np.linalg.eigvalsh(correlations)[:, 0] > MIN_EIGENVALUE
+    _refuse(steps, ~(symmetric & definite), "its covariance is not symmetric and positive definite")
+
+
+def _refuse(steps: Sequence[PairEstimate], bad: NDArray[np.bool_], reason: str) -> None:
+    if bad.any():
+        raise LogError(f"pair estimate at {steps[int(bad.argmax())].target_stamp_ns} ns: {reason}")
+
+
+def solve_pairs(steps: Sequence[PairEstimate]) -> Trajectory:
+    """The graph of the pairs alone: the raw chain, with marginal covariances."""
+    return _optimise(_pair_graph(steps, 1.0), _pose_values(chain(steps)), steps)
+
+
+def compare_rotations(
+    steps: Sequence[PairEstimate], windows: Sequence[ImuWindow | None], config: PoseGraphConfig
+) -> GyroComparison:
+    """Gate, bias and correlation in time from the difference of gyro and pair rates, of which some must be measured.
+
+    Errors of odometry are correlated in time, so that their mean is less certain than independent pairs would make
+    it. The scatter of the means of batches shows by how much; what is constant over the whole log shows nowhere and
+    is assumed (config.pair_rotation_rate_sigma).
+
+    A gyro that an inertial navigation system has corrected has no bias left, and then its prior is worth more than
+    the pairs; a bare one has a large bias, which only the pairs can tell. Which of the two it is follows from the
+    mean difference, by the likelihood ratio of the two priors.
+    """
+    measured = np.array([window is not None for window in windows])
+    seconds = np.array([step.duration_s for step in steps])[measured]
+    turned = motions_of(steps).rotation.as_rotvec()[measured]
+    by_gyro = np.array([window.durations @ window.angular_velocity for window in windows if window is not None])
+    difference = (by_gyro - turned) / seconds[:, None]
+    claimed = np.array([np.trace(step.covariance[:3, :3]) / 3 for step in steps])[measured] / seconds**2
+
+    square = np.sum((difference - np.median(difference, axis=0)) ** 2, axis=1) / claimed
+    scale = max(1.0, float(np.median(square) / chi2.median(3)))
+    inlier = square <= scale * chi2.isf(config.gate_probability, 3)
+    agrees = measured.copy()
+    agrees[measured] = inlier
+
+    difference, weight = difference[inlier], 1.0 / claimed[inlier]
+    bias = np.average(difference, axis=0, weights=weight)
+    means = [
+        np.average(values, axis=0, weights=weights)
+        for values, weights in zip(np.array_split(difference, BATCHES), np.array_split(weight, BATCHES), strict=True)
+    ]
+    variance = float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES + config.pair_rotation_rate_sigma**2
+    inflation = np.sqrt(max(1.0, variance * weight.sum()))
+
+    sigmas = (config.corrected_gyro_bias_sigma, config.gyro_bias_sigma)
+    corrected, bare = (variance + sigma**2 for sigma in sigmas)
+    is_corrected = bias @ bias * (1.0 / corrected - 1.0 / bare) < 3.0 * np.log(bare / corrected)
+    return GyroComparison(bias, sigmas[0] if is_corrected else sigmas[1], float(inflation), agrees)
+
+
+def solve_inertial(
+    steps: Sequence[PairEstimate], windows: Sequence[ImuWindow | None], gyro: GyroComparison, config: PoseGraphConfig
+) -> Trajectory:
+    """The graph of pairs and IMU, whose windows (one a step, some None) start from the bias that the gyro shows."""
+    raw = chain(steps)
+    graph, values = _pair_graph(steps, gyro.inflation), _pose_values(raw)
+    bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro.bias)
+    parameters = _preintegration_parameters(config)
+    used = [(k, window) for k, window in enumerate(windows) if window is not None]
+    for k, window in used:
+        preintegrated = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
+        for duration, rate, acceleration in zip(*window, strict=True):
+            preintegrated.integrateMeasurement(acceleration, rate, duration)
+        graph.add(
+            gtsam.CombinedImuFactorWithGravityDirection(
+                X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), G(0), preintegrated, GRAVITY
+            )
+        )
+
+    velocities = np.gradient(raw.poses.translation, raw.stamps_ns / NANOSECONDS, axis=0)
+    states = sorted({state for k, _ in used for state in (k, k + 1)})
+    for k in states:
+        values.insert(V(k), velocities[k])
+        values.insert(B(k), bias)
+    values.insert(G(0), gtsam.Unit3(_gravity(used[:GRAVITY_STEPS], raw, velocities)))
+
+    sigmas = np.repeat([config.accelerometer_bias_sigma, gyro.bias_sigma], 3)
+    prior = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    graph.add(gtsam.PriorFactorConstantBias(B(states[0]), gtsam.imuBias.ConstantBias(), prior))
+    walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3)
+    for before, after in pairwise(states):
+        if windows[before] is None:
+            seconds = (raw.stamps_ns[after] - raw.stamps_ns[before]) / NANOSECONDS
+            noise = gtsam.noiseModel.Diagonal.Sigmas(walk * np.sqrt(seconds))
+            graph.add(gtsam.BetweenFactorConstantBias(B(before), B(after), gtsam.imuBias.ConstantBias(), noise))
+    return _optimise(graph, values, steps)
+
+
+def _windows(steps: Sequence[PairEstimate], inertial: ImuSeries) -> list[ImuWindow | None]:
+    windows = ImuWindows(inertial)
+    return [windows.over(step.source_stamp_ns, step.target_stamp_ns) for step in steps]
+
+
+def _preintegration_parameters(config: PoseGraphConfig) -> gtsam.PreintegrationCombinedParams:
+    parameters = gtsam.PreintegrationCombinedParams(np.zeros(3))  # gravity is a variable of the graph
+    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
+    parameters.setAccelerometerCovariance(config.accelerometer_noise**2 * np.eye(3))
+    parameters.setBiasOmegaCovariance(config.gyro_bias_walk**2 * np.eye(3))
+    parameters.setBiasAccCovariance(config.accelerometer_bias_walk**2 * np.eye(3))
+    parameters.setIntegrationCovariance(INTEGRATION_SIGMA**2 * np.eye(3))
+    return parameters
+
+
+def _gravity(windows: Sequence[tuple[int, ImuWindow]], raw: Trajectory, velocities: FloatArray) -> FloatArray:
+    """Where gravity points in the first camera's frame, from some windows (with their step) and the raw trajectory.
+
+    An accelerometer shows acceleration less gravity, so that gravity is what the change of velocity is short of.
+    """
+    rotations = raw.poses.rotation.as_matrix()
+    shown = sum(rotations[k] @ (window.durations @ window.linear_acceleration) for k, window in windows)
+    gained = sum(velocities[k + 1] - velocities[k] for k, _ in windows)
+    return np.asarray(gained - shown)
+
+
+def _pair_graph(steps: Sequence[PairEstimate], rotation_inflation: float) -> gtsam.NonlinearFactorGraph:
+    """The first pose fixed, and a factor for every step."""
+    graph = gtsam.NonlinearFactorGraph()
+    fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
+    scale = np.repeat([rotation_inflation, 1.0], 3)
+    for k, (step, motion) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
+        noise = gtsam.noiseModel.Gaussian.Covariance(np.outer(scale, scale) * step.covariance)
+        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(motion), noise))
+    return graph
+
+
+def _pose_values(trajectory: Trajectory) -> gtsam.Values:
+    values = gtsam.Values()
+    for k, pose in enumerate(trajectory.poses.as_matrix()):
+        values.insert(X(k), gtsam.Pose3(pose))
+    return values
+
+
+def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, steps: Sequence[PairEstimate]) -> Trajectory:
+    """Solve the graph from the given values; the marginals come from iSAM2, GTSAM's only ones by QR in Python."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+
+    tree_parameters = gtsam.ISAM2Params()
+    tree_parameters.setFactorization("QR")
+    tree = gtsam.ISAM2(tree_parameters)
+    tree.update(graph, solution)
+    stamps = stamps_of(steps)
+    covariances = np.stack([tree.marginalCovariance(X(k)) for k in range(len(stamps))])
+    covariances[0] = 0.0  # the world itself
+    poses = np.stack([solution.atPose3(X(k)).matrix() for k in range(len(stamps))])
+    return Trajectory(stamps, RigidTransform.from_matrix(poses), covariances)
