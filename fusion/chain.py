@@ -26,6 +26,8 @@ UNKNOWN_GYRO_RATE = 0.01  # rad/s
 
 # An IMU has a hole where samples are further apart than this many of its periods.
 MAX_IMU_PERIODS = 2.5
+# So many samples that all show the same are those of a sensor that is stuck.
+MIN_REPEATS = 4
 
 
 class ImuWindow(NamedTuple):
@@ -52,14 +54,14 @@ class ImuWindows:
         self._longest_ns = MAX_IMU_PERIODS * np.median(np.diff(self._stamps)) if len(imu) > 1 else 0.0
 
     def over(self, start_ns: int, end_ns: int) -> ImuWindow | None:
-        """The window from start to end, or None where the samples do not cover all of it without a hole."""
+        """The window from start to end, or None where the samples do not cover it without a hole, or are stuck."""
         first = int(np.searchsorted(self._stamps, start_ns, side="right")) - 1
         last = int(np.searchsorted(self._stamps, end_ns))
         if first < 0 or last >= len(self._stamps):
             return None
         stamps, values = self._stamps[first : last + 1], self._values[first : last + 1]
         gaps = np.diff(stamps)
-        if np.max(gaps) > self._longest_ns:
+        if np.max(gaps) > self._longest_ns or _stuck(values[:, :3]) or _stuck(values[:, 3:]):
             return None
         at_start = values[0] + (values[1] - values[0]) * ((start_ns - stamps[0]) / gaps[0])
         at_end = values[-1] - (values[-1] - values[-2]) * ((stamps[-1] - end_ns) / gaps[-1])
@@ -67,6 +69,11 @@ class ImuWindows:
         means = (edges[1:] + edges[:-1]) / 2
         seconds = np.clip(stamps - start_ns, 0, end_ns - start_ns) / NANOSECONDS
         return ImuWindow(np.diff(seconds), means[:, :3], means[:, 3:])
+
+
+def _stuck(values: FloatArray) -> bool:
+    """Whether samples (M, 3) repeat one value on all axes: a live sensor has noise."""
+    return len(values) >= MIN_REPEATS and not np.any(np.diff(values, axis=0))
 
 
 def adjoint(transform: RigidTransform) -> FloatArray:

@@ -37,7 +37,8 @@ MIN_PAIRS = 40  # that the IMU measured from start to end
 MIN_COVERAGE = 0.5  # their share of all pairs
 MIN_EXPLAINED = 0.5  # share of the pairs' turning (as variance) that the gyro explains
 MIN_EXPLAINED_GIVEN = -0.1  # the same with a given mounting: on a straight road there is nothing to explain
-MAX_SCALE_ERROR = 0.03  # of the gyro against the pairs
+MIN_EXPLAINED_AXIS = -0.5  # about each axis; an axis that the gyro has reversed is at -3
+MAX_SCALE_ERROR = 0.02  # of the gyro against the pairs
 MAX_ROTATION_STD_RAD = float(np.deg2rad(2.0))
 MAX_TIME_OFFSET_STD_S = 0.02
 GRAVITY_RANGE = (8.8, 10.8)  # m/s^2, for the median magnitude that the accelerometer shows
@@ -108,6 +109,8 @@ def calibrate(
         return left_out(f"it measured {covered.sum()} pairs from start to end, and {MIN_PAIRS} are needed")
     if covered.mean() < MIN_COVERAGE:
         return left_out(f"it measured only {covered.mean():.0%} of the pairs")
+    if time_offset_s is None and abs(offset_s) >= MAX_TIME_OFFSET_S:
+        return left_out(f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's")
     if correlation < MIN_CORRELATION:
         return left_out(f"its angular rates do not follow those of the pairs (correlation {correlation:.2f} at best)")
 
@@ -258,22 +261,23 @@ class _Fit:
         return np.round(seconds * NANOSECONDS).astype(np.int64)
 
     @property
-    def explained(self) -> float:
-        """Share of the pairs' turning (about its mean) that the gyro explains; outliers count little."""
-        weight = 1.0 / (1.0 + (self.deviation / CAUCHY) ** 2)[:, None]
-        turned = self.turns.turned - np.average(self.turns.turned, axis=0, weights=weight[:, 0])
-        unexplained = np.sum(weight * (self.turns.turned - self.predicted) ** 2)
-        return float(1.0 - unexplained / np.sum(weight * turned**2))
+    def explained(self) -> FloatArray:
+        """Share of the pairs' turning, about its mean, that the gyro explains: about each axis, and in all (4,)."""
+        weight = 1.0 / (1.0 + (self.deviation / CAUCHY) ** 2)
+        turned = self.turns.turned - np.average(self.turns.turned, axis=0, weights=weight)
+        unexplained, variance = weight @ (self.turns.turned - self.predicted) ** 2, weight @ turned**2
+        return np.asarray(1.0 - np.append(unexplained, unexplained.sum()) / np.append(variance, variance.sum()))
 
     @property
     def scale(self) -> tuple[float, float]:
-        """The pairs' turning as a multiple of the gyro's, and its standard deviation: a median over the quicker half."""
-        square = np.sum(self.predicted**2, axis=1)
-        quick = square >= np.median(square)
-        ratio = np.sum(self.predicted * self.turns.turned, axis=1)[quick] / square[quick]
-        median = np.median(ratio)
-        std = 1.25 * MAD_TO_STD * np.median(np.abs(ratio - median)) / np.sqrt(len(ratio))
-        return float(median), float(std)
+        """The pairs' turning as a multiple of the gyro's (least absolute deviations), and its standard deviation."""
+        angle = np.linalg.norm(self.predicted, axis=1)
+        along = np.sum(self.predicted * self.turns.turned, axis=1) / np.maximum(angle, np.finfo(float).tiny)
+        order = np.argsort(along / np.maximum(angle, np.finfo(float).tiny))
+        middle = order[np.searchsorted(np.cumsum(angle[order]), angle.sum() / 2)]  # the weighted median
+        scale = along[middle] / angle[middle]
+        std = np.sqrt(np.pi / 2) * _robust_std(along - scale * angle) / np.linalg.norm(angle)
+        return float(scale), float(std)
 
 
 def _correlate(gyro: _Gyro, turns: _Turns) -> tuple[float, float]:
@@ -372,19 +376,21 @@ def _robust_std(values: FloatArray) -> FloatArray:
 
 def _fit_problem(fit: _Fit) -> str | None:
     """Why a fit does not carry the use of the IMU, or None."""
-    scale, scale_std = fit.scale
-    estimated = fit.std[ROTATION].max() > 0.0
     rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
+    *by_axis, explained = fit.explained
+    scale, scale_std = fit.scale
+    if abs(fit.moved_s) > TIME_OFFSET_PRIOR_S or offset_std > MAX_TIME_OFFSET_STD_S:
+        return f"the motion does not show its time offset (+-{1e3 * max(offset_std, abs(fit.moved_s)):.0f} ms)"
+    if rotation_std > MAX_ROTATION_STD_RAD:
+        return f"the motion does not show its mounting (+-{np.rad2deg(rotation_std):.1f} deg)"
+    if explained < (MIN_EXPLAINED if rotation_std > 0.0 else MIN_EXPLAINED_GIVEN):
+        return f"its gyro explains too little of the pairs' turning ({max(explained, 0.0):.0%}), or they turn too little"
+    if min(by_axis) < MIN_EXPLAINED_AXIS:
+        return f"its gyro turns the other way than the pairs about the camera's {'xyz'[int(np.argmin(by_axis))]} axis"
+    if abs(scale - 1.0) > MAX_SCALE_ERROR + 2.0 * scale_std:
+        return f"its gyro shows {1.0 / scale:.3g} times the turning of the pairs"
     if fit.faulty.mean() > MAX_FAULTY_SHARE:
         return f"its gyro contradicts the pairs for {fit.faulty.mean():.0%} of the time"
-    if abs(scale - 1.0) > MAX_SCALE_ERROR + 2.0 * scale_std:
-        return f"its gyro shows {1.0 / scale:.3g} times the turning of the pairs" if scale > 0 else "its gyro is reversed"
-    if fit.explained < (MIN_EXPLAINED if estimated else MIN_EXPLAINED_GIVEN):
-        return f"its gyro explains {max(fit.explained, 0.0):.0%} of the pairs' turning: too little, or too little turning"
-    if rotation_std > MAX_ROTATION_STD_RAD:
-        return f"the motion shows its mounting to no better than {np.rad2deg(rotation_std):.1f} deg"
-    if abs(fit.moved_s) > 2.0 * TIME_OFFSET_PRIOR_S or offset_std > MAX_TIME_OFFSET_STD_S:
-        return f"the motion shows its time offset to no better than {1e3 * max(offset_std, abs(fit.moved_s)):.0f} ms"
     return None
 
 
@@ -394,5 +400,5 @@ def _summary(fit: _Fit) -> str:
     mounting = f"estimated to {np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
     offset = f"estimated to {1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
     faulty = f"; left out in {len(fit.faulty_intervals())} faulty stretches" if fit.faulty.any() else ""
-    explained = f"its gyro explains {fit.explained:.1%} of the turning of {len(fit.predicted)} pairs"
+    explained = f"its gyro explains {fit.explained[-1]:.1%} of the turning of {len(fit.predicted)} pairs"
     return f"{explained}; mounting {mounting}, time offset {offset}{faulty}"

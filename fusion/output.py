@@ -41,7 +41,10 @@ PACKAGES = ("violearner-fusion", "numpy", "scipy", "torch", "gtsam", "filterpy",
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that a run read and computed; trajectories and metrics by name: raw, posegraph, ekf."""
+    """All that a run read and computed; trajectories and metrics by name: raw, posegraph, ekf.
+
+    remarks: what the back ends say about their work, in a line each.
+    """
 
     log: Log
     config: RunConfig
@@ -50,6 +53,7 @@ class Outcome:
     ground_truth: Trajectory | None
     calibration: ImuCalibration
     trajectories: Mapping[str, Trajectory]
+    remarks: Mapping[str, str]
     metrics: Mapping[str, Metrics]
     findings: Findings
 

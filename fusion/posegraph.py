@@ -12,7 +12,7 @@ systems are solved by QR: Cholesky fails on graphs whose factors differ so much 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import gtsam
@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from fusion.chain import ImuWindow, ImuWindows, chain, motions_of, stamps_of
 from fusion.config import PoseGraphConfig
 from fusion_io.errors import LogError
-from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate, Trajectory
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first direction of gravity
@@ -33,36 +33,40 @@ FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that 
 INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
 BATCHES = 10  # whose means tell how far the errors of pairs are correlated in time
 MIN_WINDOWS = 2 * BATCHES
+REJECTED_INFLATION = 100.0  # on the standard deviations of a pair that is left out: no more than a hint
 MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance is singular but for rounding
 
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphResult:
-    """The fused trajectory with the marginal covariance of every pose, and what the graph made of the IMU.
+    """The fused trajectory with the marginal covariance of every pose, and what became of the measurements.
 
-    note: one line on how the IMU was used, or why it was not. imu_factors: steps with a preintegrated factor;
-    rejected: steps that the IMU measured, but where its rotation contradicts the pair's beyond noise.
+    note: one line on how the IMU was used, or why it was not. imu_factors: steps with a preintegrated factor. Where
+    the rotations of IMU and pair contradict each other beyond noise, one of them is left out: imu_rejected and
+    pairs_rejected count those.
     """
 
     trajectory: Trajectory
     note: str
     imu_factors: int = 0
-    rejected: int = 0
+    imu_rejected: int = 0
+    pairs_rejected: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class GyroComparison:
     """What the rotations of gyro and pairs say of each other.
 
-    bias (3,) rad/s: the mean difference of their rates. bias_sigma: how well the gyro's bias is known to be near zero
-    before it is compared. inflation: the factor on the standard deviation of pair rotations after which sums over
-    time are as uncertain as they are. agrees (N,): steps where the two differ by no more than noise.
+    bias (3,) rad/s: the mean difference of their rates. bias_sigma: how far from zero the gyro's bias may be, before
+    the pairs are asked. inflation: the factor on the standard deviation of pair rotations after which their sums over
+    time are as uncertain as they are. imu_wrong, pair_wrong (N,): steps where one of the two is beyond noise.
     """
 
     bias: FloatArray
     bias_sigma: float
     inflation: float
-    agrees: NDArray[np.bool_]
+    imu_wrong: NDArray[np.bool_]
+    pair_wrong: NDArray[np.bool_]
 
 
 def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: PoseGraphConfig) -> PoseGraphResult:
@@ -75,20 +79,23 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Pos
     check(steps)
     if inertial is None:
         return PoseGraphResult(solve_pairs(steps), "pairs only")
-    windows = _windows(steps, inertial)
+    samples = ImuWindows(inertial)
+    windows = [samples.over(step.source_stamp_ns, step.target_stamp_ns) for step in steps]
     measured = sum(window is not None for window in windows)
     if measured < MIN_WINDOWS:
         return PoseGraphResult(solve_pairs(steps), f"pairs only: the IMU measured {measured} of {len(steps)} steps")
     gyro = compare_rotations(steps, windows, config)
-    rejected = sum(window is not None for window in windows) - int(gyro.agrees.sum())
-    used = [window if agrees else None for window, agrees in zip(windows, gyro.agrees, strict=True)]
+    used = [None if wrong else window for window, wrong in zip(windows, gyro.imu_wrong, strict=True)]
+    weighed = _weigh(steps, gyro)
     try:
-        trajectory = solve_inertial(steps, used, gyro, config)
+        trajectory = solve_inertial(weighed, used, gyro, config)
     except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException
         reason = " ".join(str(error).split())
         return PoseGraphResult(solve_pairs(steps), f"pairs only: the graph with the IMU has no solution ({reason})")
-    note = f"IMU factors on {measured - rejected} of {len(steps)} steps"
-    return PoseGraphResult(trajectory, note, measured - rejected, rejected)
+    imu_rejected, pairs_rejected = int(gyro.imu_wrong.sum()), int(gyro.pair_wrong.sum())
+    factors = measured - imu_rejected
+    note = f"IMU on {factors} of {len(steps)} steps; rejected: IMU on {imu_rejected}, pair on {pairs_rejected}"
+    return PoseGraphResult(trajectory, note, factors, imu_rejected, pairs_rejected)
 
 
 def check(steps: Sequence[PairEstimate]) -> None:
@@ -108,55 +115,80 @@ def check(steps: Sequence[PairEstimate]) -> None:
     _refuse(steps, ~(symmetric & definite), "its covariance is not symmetric and positive definite")
 
 
-def _refuse(steps: Sequence[PairEstimate], bad: NDArray[np.bool_], reason: str) -> None:
+def _refuse(steps: Sequence[PairEstimate], bad: NDArray[np.bool_] | np.bool_, reason: str) -> None:
     if bad.any():
         raise LogError(f"pair estimate at {steps[int(bad.argmax())].target_stamp_ns} ns: {reason}")
 
 
 def solve_pairs(steps: Sequence[PairEstimate]) -> Trajectory:
     """The graph of the pairs alone: the raw chain, with marginal covariances."""
-    return _optimise(_pair_graph(steps, 1.0), _pose_values(chain(steps)), steps)
+    return _optimise(_pair_graph(steps), _pose_values(chain(steps)), stamps_of(steps))
 
 
 def compare_rotations(
     steps: Sequence[PairEstimate], windows: Sequence[ImuWindow | None], config: PoseGraphConfig
 ) -> GyroComparison:
-    """Gate, bias and correlation in time from the difference of gyro and pair rates, of which some must be measured.
+    """Outliers, gyro bias, and correlation in time from the differences between the rates of gyro and pairs.
 
     Errors of odometry are correlated in time, so that their mean is less certain than independent pairs would make
-    it. The scatter of the means of batches shows by how much; what is constant over the whole log shows nowhere and
-    is assumed (config.pair_rotation_rate_sigma).
+    it. The scatter of the means of batches shows by how much (Law and Carson, 1979); an error that is constant over
+    the log shows nowhere, and is assumed: config.pair_rotation_rate_sigma.
 
-    A gyro that an inertial navigation system has corrected has no bias left, and then its prior is worth more than
-    the pairs; a bare one has a large bias, which only the pairs can tell. Which of the two it is follows from the
-    mean difference, by the likelihood ratio of the two priors.
+    A gyro that a navigation system has corrected has hardly a bias, and knowing that is worth more than the pairs; a
+    bare one has a large bias, which only the pairs can tell. Where the mean difference could be chance, it is the first.
     """
     measured = np.array([window is not None for window in windows])
-    seconds = np.array([step.duration_s for step in steps])[measured]
-    turned = motions_of(steps).rotation.as_rotvec()[measured]
-    by_gyro = np.array([window.durations @ window.angular_velocity for window in windows if window is not None])
-    difference = (by_gyro - turned) / seconds[:, None]
-    claimed = np.array([np.trace(step.covariance[:3, :3]) / 3 for step in steps])[measured] / seconds**2
+    seconds = np.array([step.duration_s for step in steps])[measured, None]
+    by_pair = motions_of(steps).rotation.as_rotvec()[measured] / seconds
+    turned = np.array([window.durations @ window.angular_velocity for window in windows if window is not None])
+    by_gyro = turned / seconds
+    claimed = np.array([np.trace(step.covariance[:3, :3]) / 3 for step in steps])[measured] / seconds[:, 0] ** 2
 
-    square = np.sum((difference - np.median(difference, axis=0)) ** 2, axis=1) / claimed
+    agree = _without_outliers(by_gyro - by_pair, claimed, config.gate_probability)
+    bias, variance = _mean(by_gyro[agree] - by_pair[agree], claimed[agree])
+    variance += config.pair_rotation_rate_sigma**2
+    inflation = max(1.0, float(np.sqrt(variance * np.sum(1.0 / claimed[agree]))))
+
+    corrected = bias @ bias / (variance + config.corrected_gyro_bias_sigma**2) < chi2.isf(0.05, 3)
+    bias_sigma = config.corrected_gyro_bias_sigma if corrected else config.gyro_bias_sigma
+
+    # Motion is smooth: of two that contradict each other, the one that leaves its neighbours' rate further is wrong.
+    time = np.array([step.source_stamp_ns for step in steps])[measured]
+    smooth = np.stack([np.interp(time, time[agree], axis) for axis in by_gyro[agree].T], axis=1)
+    pair_leaves_further = _norm(by_pair + bias - smooth) > _norm(by_gyro - smooth)
+    imu_wrong, pair_wrong = np.zeros((2, len(steps)), dtype=np.bool_)
+    imu_wrong[measured] = ~agree & ~pair_leaves_further
+    pair_wrong[measured] = ~agree & pair_leaves_further
+    return GyroComparison(bias, bias_sigma, inflation, imu_wrong, pair_wrong)
+
+
+def _without_outliers(differences: FloatArray, variances: FloatArray, probability: float) -> NDArray[np.bool_]:
+    """Which (N, 3) lie within a chi-square gate about their median, widened where variances (N,) prove too small."""
+    square = np.sum((differences - np.median(differences, axis=0)) ** 2, axis=1) / variances
     scale = max(1.0, float(np.median(square) / chi2.median(3)))
-    inlier = square <= scale * chi2.isf(config.gate_probability, 3)
-    agrees = measured.copy()
-    agrees[measured] = inlier
+    return np.asarray(square <= scale * chi2.isf(probability, 3))
 
-    difference, weight = difference[inlier], 1.0 / claimed[inlier]
-    bias = np.average(difference, axis=0, weights=weight)
-    means = [
-        np.average(values, axis=0, weights=weights)
-        for values, weights in zip(np.array_split(difference, BATCHES), np.array_split(weight, BATCHES), strict=True)
+
+def _mean(values: FloatArray, variances: FloatArray) -> tuple[FloatArray, float]:
+    """The weighted mean (3,) of a series (N, 3), and the variance of its components by the method of batch means."""
+    weights = 1.0 / variances
+    batches = zip(np.array_split(values, BATCHES), np.array_split(weights, BATCHES), strict=True)
+    means = [np.average(batch, axis=0, weights=weight) for batch, weight in batches]
+    return np.average(values, axis=0, weights=weights), float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES
+
+
+def _norm(vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(vectors, axis=1))
+
+
+def _weigh(steps: Sequence[PairEstimate], gyro: GyroComparison) -> list[PairEstimate]:
+    """The steps with the covariances that the gyro shows to be right."""
+    scale = np.repeat([gyro.inflation, 1.0], 3)
+    inflated = np.outer(scale, scale)
+    return [
+        replace(step, covariance=step.covariance * inflated * (REJECTED_INFLATION**2 if wrong else 1.0))
+        for step, wrong in zip(steps, gyro.pair_wrong, strict=True)
     ]
-    variance = float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES + config.pair_rotation_rate_sigma**2
-    inflation = np.sqrt(max(1.0, variance * weight.sum()))
-
-    sigmas = (config.corrected_gyro_bias_sigma, config.gyro_bias_sigma)
-    corrected, bare = (variance + sigma**2 for sigma in sigmas)
-    is_corrected = bias @ bias * (1.0 / corrected - 1.0 / bare) < 3.0 * np.log(bare / corrected)
-    return GyroComparison(bias, sigmas[0] if is_corrected else sigmas[1], float(inflation), agrees)
 
 
 def solve_inertial(
@@ -164,7 +196,7 @@ def solve_inertial(
 ) -> Trajectory:
     """The graph of pairs and IMU, whose windows (one a step, some None) start from the bias that the gyro shows."""
     raw = chain(steps)
-    graph, values = _pair_graph(steps, gyro.inflation), _pose_values(raw)
+    graph, values = _pair_graph(steps), _pose_values(raw)
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro.bias)
     parameters = _preintegration_parameters(config)
     used = [(k, window) for k, window in enumerate(windows) if window is not None]
@@ -194,12 +226,7 @@ def solve_inertial(
             seconds = (raw.stamps_ns[after] - raw.stamps_ns[before]) / NANOSECONDS
             noise = gtsam.noiseModel.Diagonal.Sigmas(walk * np.sqrt(seconds))
             graph.add(gtsam.BetweenFactorConstantBias(B(before), B(after), gtsam.imuBias.ConstantBias(), noise))
-    return _optimise(graph, values, steps)
-
-
-def _windows(steps: Sequence[PairEstimate], inertial: ImuSeries) -> list[ImuWindow | None]:
-    windows = ImuWindows(inertial)
-    return [windows.over(step.source_stamp_ns, step.target_stamp_ns) for step in steps]
+    return _optimise(graph, values, raw.stamps_ns)
 
 
 def _preintegration_parameters(config: PoseGraphConfig) -> gtsam.PreintegrationCombinedParams:
@@ -223,14 +250,13 @@ def _gravity(windows: Sequence[tuple[int, ImuWindow]], raw: Trajectory, velociti
     return np.asarray(gained - shown)
 
 
-def _pair_graph(steps: Sequence[PairEstimate], rotation_inflation: float) -> gtsam.NonlinearFactorGraph:
+def _pair_graph(steps: Sequence[PairEstimate]) -> gtsam.NonlinearFactorGraph:
     """The first pose fixed, and a factor for every step."""
     graph = gtsam.NonlinearFactorGraph()
     fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
     graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
-    scale = np.repeat([rotation_inflation, 1.0], 3)
     for k, (step, motion) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
-        noise = gtsam.noiseModel.Gaussian.Covariance(np.outer(scale, scale) * step.covariance)
+        noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance)
         graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(motion), noise))
     return graph
 
@@ -242,18 +268,17 @@ def _pose_values(trajectory: Trajectory) -> gtsam.Values:
     return values
 
 
-def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, steps: Sequence[PairEstimate]) -> Trajectory:
+def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps_ns: IntArray) -> Trajectory:
     """Solve the graph from the given values; the marginals come from iSAM2, GTSAM's only ones by QR in Python."""
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    solver = gtsam.LevenbergMarquardtParams()
+    solver.setLinearSolverType("MULTIFRONTAL_QR")
+    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, solver).optimize()
 
-    tree_parameters = gtsam.ISAM2Params()
-    tree_parameters.setFactorization("QR")
-    tree = gtsam.ISAM2(tree_parameters)
+    elimination = gtsam.ISAM2Params()
+    elimination.setFactorization("QR")
+    tree = gtsam.ISAM2(elimination)
     tree.update(graph, solution)
-    stamps = stamps_of(steps)
-    covariances = np.stack([tree.marginalCovariance(X(k)) for k in range(len(stamps))])
+    poses = np.stack([solution.atPose3(X(k)).matrix() for k in range(len(stamps_ns))])
+    covariances = np.stack([tree.marginalCovariance(X(k)) for k in range(len(stamps_ns))])
     covariances[0] = 0.0  # the world itself
-    poses = np.stack([solution.atPose3(X(k)).matrix() for k in range(len(stamps))])
-    return Trajectory(stamps, RigidTransform.from_matrix(poses), covariances)
+    return Trajectory(stamps_ns, RigidTransform.from_matrix(poses), covariances)

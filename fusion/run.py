@@ -64,17 +64,20 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
 
     steps, gaps = chain.bridge_gaps(log.frame_stamps(), pairs, inertial)
     findings.put("gaps_bridged", gaps, f"gaps between pair estimates that were bridged: {gaps}")
-    trajectories = {"raw": chain.chain(steps)}
+    trajectories, remarks = {"raw": chain.chain(steps)}, {}
     stopwatch.lap("raw")
 
     for name in back_ends(config):
-        trajectories |= fuse(name, steps, inertial, config, findings)
+        if fused := fuse(name, steps, inertial, config, findings):
+            trajectories[name], remarks[name] = fused
         stopwatch.lap(name)
 
     metrics = {name: evaluate(each, ground_truth, config.segment_lengths_m) for name, each in trajectories.items()}
     stopwatch.lap("evaluation")
 
-    outcome = output.Outcome(log, config, samples, pairs, ground_truth, calibration, trajectories, metrics, findings)
+    outcome = output.Outcome(
+        log, config, samples, pairs, ground_truth, calibration, trajectories, remarks, metrics, findings
+    )
     output.write_log(folder, outcome)
     output.write_text(folder, outcome)
     stopwatch.lap("writing")
@@ -130,34 +133,35 @@ def back_ends(config: RunConfig) -> Sequence[str]:
 
 def fuse(
     name: str, steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: RunConfig, findings: Findings
-) -> dict[str, Trajectory]:
-    """The trajectory of a back end by its name; empty, and counted, where it fails: the others shall still come out."""
+) -> tuple[Trajectory, str] | None:
+    """The trajectory of a back end and its remark on it; None, and counted, where it fails: the others are not lost."""
     from numpy.linalg import LinAlgError
-
-    from fusion import ekf, posegraph
 
     try:
         if name == "posegraph":
+            from fusion import posegraph
+
             graph = posegraph.solve(steps, inertial, config.posegraph)
-            findings.put("posegraph_rejected", graph.rejected, f"steps left out of the IMU factors: {graph.rejected}")
-            return {name: graph.trajectory}
+            rejected = graph.imu_rejected + graph.pairs_rejected
+            findings.put("posegraph_rejected", rejected, f"measurements rejected by the pose graph: {rejected}")
+            return graph.trajectory, graph.note
+        from fusion import ekf
+
         filtered = ekf.solve(steps, inertial, config.ekf)
-        findings.put(
-            "ekf_rejected", filtered.rejected, f"pair estimates stopped by the EKF's gate: {filtered.rejected}"
-        )
-        return {name: filtered.trajectory}
+        findings.put("ekf_rejected", filtered.rejected, f"measurements rejected by the EKF: {filtered.rejected}")
+        return filtered.trajectory, filtered.note
     except (FusionError, LinAlgError, RuntimeError) as error:  # GTSAM's solvers raise RuntimeError
         findings.put(f"{name}_failed", 1, f"back end failed ({name}): {' '.join(str(error).split())}")
-        return {}
+        return None
 
 
 def report(folder: Path, outcome: Outcome) -> None:
-    """Print the table, the verdict on the IMU and where the results are to stdout, and the warnings to stderr."""
+    """Print the table, what became of the IMU and where the results are to stdout, and the warnings to stderr."""
     from dataclasses import asdict
 
     from rich.console import Console
 
-    from fusion.table import print_table
+    from fusion.table import HEADINGS, print_table
 
     log, calibration = outcome.log, outcome.calibration
     for note in (*log.notes, *outcome.findings.notes):
@@ -166,6 +170,8 @@ def report(folder: Path, outcome: Outcome) -> None:
     metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
     print_table(Console(), title, outcome.trajectories, metrics)
     print(f"IMU {'used' if calibration.used else 'left out'}: {calibration.reason}")
+    for name, remark in outcome.remarks.items():
+        print(f"{HEADINGS[name]}: {remark}")
     print(f"Results: {folder}")
 
 

@@ -119,12 +119,12 @@ def test_odometry_covariance_describes_the_same_uncertainty() -> None:
     R = Rotation.random(rng=rng)
     pose = PoseSample(np.zeros(3), R.as_quat(scalar_first=True), root @ root.T)
     message = messages.TYPESTORE.deserialize_cdr(messages.encode_odometry(0, pose, "c"), messages.ODOMETRY)
-    xi = rng.normal(size=(100_000, 6)) @ root.T
+    xi = rng.normal(size=(20_000, 6)) @ root.T
     shift = R.apply(xi[:, 3:])
     turn = (R * Rotation.from_rotvec(xi[:, :3]) * R.inv()).as_rotvec()
     scatter = np.cov(np.hstack([shift, turn]).T)
     stated = message.pose.covariance.reshape(6, 6)
-    np.testing.assert_allclose(scatter, stated, atol=0.03 * np.abs(stated).max())
+    np.testing.assert_allclose(scatter, stated, atol=0.05 * np.abs(stated).max())
 
 
 def test_schemas_stand_alone() -> None:
@@ -154,7 +154,7 @@ def test_images_round_trip(shape: tuple[int, ...]) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(arrays(np.float32, (3, 4), elements=st.floats(width=32)))
+@given(arrays(np.float32, (2, 3), elements=st.floats(width=32)))
 def test_depth_is_rounded_to_a_256th_of_a_metre_and_invalid_is_zero(values) -> None:
     values = np.where(values > 30_000, np.inf, values).astype(np.float32)  # beyond that float32 itself is coarser
     read = messages.decode_depth(messages.IMAGE, messages.encode_depth(START, values))
@@ -164,7 +164,7 @@ def test_depth_is_rounded_to_a_256th_of_a_metre_and_invalid_is_zero(values) -> N
     np.testing.assert_array_equal(messages.decode_depth(messages.IMAGE, messages.encode_depth(START, read)), read)
 
 
-COLOUR = np.random.default_rng(1).integers(0, 256, (HEIGHT := 6, 5, 3), dtype=np.uint8)
+COLOUR = np.random.default_rng(1).integers(0, 256, (6, 5, 3), dtype=np.uint8)
 ALPHA = np.full((6, 5, 1), 9, dtype=np.uint8)
 
 
@@ -188,7 +188,7 @@ def test_raw_images_become_grey_or_rgb(encoding: str, pixels: np.ndarray, expect
 
 
 def test_rows_may_be_padded_and_big_endian() -> None:
-    millimetres = np.arange(20, dtype=">u2").reshape(4, 5) + 1000
+    millimetres = np.arange(1000, 1020, dtype=">u2").reshape(4, 5)
     padded = np.zeros((4, 16), dtype=np.uint8)
     padded[:, :10] = millimetres.view(np.uint8)
     _, kind, _, data = raw_image("/d", START, padded, "16UC1", width=5, is_bigendian=1)
@@ -229,11 +229,17 @@ def test_compressed_depth_in_millimetres_and_as_inverse_depth() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"width": WIDTH * 2}, {"height": 0}, {"step": 1}, {"data": np.zeros(3, np.uint8)}, {"encoding": "bayer_rggb8"}],
+    [{"width": WIDTH * 2}, {"height": 0}, {"step": 1}, {"data": np.zeros(3, np.uint8)}],
 )
 def test_images_that_contradict_themselves_are_refused(changes: dict) -> None:
     _, kind, _, data = raw_image("/x", START, grey(), "mono8", **changes)
     with pytest.raises(ValueError, match=r"cannot"):
+        messages.decode_image(kind, data)
+
+
+def test_an_unknown_encoding_is_named() -> None:
+    _, kind, _, data = raw_image("/x", START, grey(), "bayer_rggb8")
+    with pytest.raises(ValueError, match="bayer_rggb8"):
         messages.decode_image(kind, data)
 
 

@@ -86,6 +86,7 @@ def outcome(tmp_path: Path) -> output.Outcome:
         log.ground_truth(),
         ImuCalibration(MOUNTING, 0.065, np.zeros(3), True, "it agrees with the pairs"),
         trajectories,
+        {},
         {name: evaluate(each, truth, [0.2]) for name, each in trajectories.items()},
         findings,
     )

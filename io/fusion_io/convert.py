@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fusion_io.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, UsageError
 
 if TYPE_CHECKING:
+    from fusion_io.images import Framing
     from fusion_io.recording import Recording
 
 # Modules that bring numpy, scipy or OpenCV are imported by the function that needs them, so that --help
@@ -31,7 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else list(argv)
     args = _parser(argv).parse_args(argv)
     try:
-        return args.run(args)
+        exit_code: int = args.run(args)
+        return exit_code
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_USAGE
@@ -47,12 +49,12 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m fusion_io.convert", description="Convert a recording into a log.")
     kinds = parser.add_subparsers(title="kinds of recording", required=True, metavar="KIND")
 
-    trajectory = kinds.add_parser("trajectory", help="a published odometry result, as recorded pair estimates")
-    _add_trajectory_arguments(trajectory)
-    trajectory.set_defaults(run=_convert, kind="trajectory", open=_open_trajectory)
-
+    _add_odometry_arguments(_add_kind(kinds, "kitti-odometry", "a sequence of the odometry benchmark", _open_odometry))
+    _add_raw_arguments(_add_kind(kinds, "kitti-raw", "a raw drive of KITTI (..._sync)", _open_raw))
+    _add_trajectory_arguments(_add_kind(kinds, "trajectory", "a published odometry result", _open_trajectory))
+    _add_folder_arguments(_add_kind(kinds, "folder", "one's own images, depth, IMU and camera file", _open_folder))
     simulate = kinds.add_parser("simulate", help="a procedural street: RGB-D, IMU, exact ground truth")
-    if "simulate" in argv:  # its arguments come from its module, which is too heavy to import for --help
+    if argv[:1] == ["simulate"]:  # its arguments come from its module, which is too heavy to import for --help
         from fusion_io import simulation
 
         simulation.add_arguments(simulate)
@@ -60,8 +62,55 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_out(parser: argparse.ArgumentParser) -> None:
+def _add_kind(
+    kinds: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    help_text: str,
+    open_recording: Callable[[argparse.Namespace], Recording],
+) -> argparse.ArgumentParser:
+    """A subcommand that writes the recording which ``open_recording`` makes of its arguments."""
+    parser = kinds.add_parser(name, help=help_text)
     parser.add_argument("--out", type=Path, required=True, metavar="X.mcap", help="the log to write")
+    parser.set_defaults(kind=name, open=open_recording, run=_convert)
+    return parser
+
+
+def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = """The official layout: sequences/NN with image_0 and image_1 (grey) or image_2 and image_3
+        (colour), calib.txt, times.txt, and poses/NN.txt as ground truth if it is there. Depth comes from stereo."""
+    parser.add_argument("--root", type=Path, required=True, metavar="DIR", help="the folder of sequences/ and poses/")
+    parser.add_argument("--sequence", required=True, metavar="NN", help="name of the sequence, such as 06")
+    parser.add_argument("--imu", type=Path, metavar="FILE.mat", help="the sequence's IMU, ten rows a frame")
+    _add_stereo_arguments(parser)
+
+
+def _add_raw_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = """A drive of rectified images with its OXTS unit as IMU and, moved into the left camera, as
+        ground truth. Depth comes from stereo."""
+    parser.add_argument("--drive", type=Path, required=True, metavar="DIR", help="the drive's folder, ..._sync")
+    parser.add_argument(
+        "--calib", type=Path, metavar="DIR", help="the folder of calib_*.txt (default: the folder that the drive is in)"
+    )
+    parser.add_argument("--gnss", action="store_true", help="also take the OXTS positions as GNSS fixes")
+    _add_stereo_arguments(parser)
+
+
+def _add_stereo_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--frames", type=frame_range, default=slice(None), metavar="A:B", help="only frames A to B - 1 (default: all)"
+    )
+    parser.add_argument("--colour", action="store_true", help="take the colour cameras (default: the grey ones)")
+    _add_framing_arguments(parser)
+
+
+def _add_framing_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--resize", type=image_size, metavar="WxH", help="scale images and depth to this size")
+    parser.add_argument(
+        "--crop-height",
+        type=positive_integer,
+        metavar="ROWS",
+        help="keep only so many rows, from the bottom (before --resize)",
+    )
 
 
 def _add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,7 +130,7 @@ def _add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ground-truth", type=Path, metavar="FILE", help="true poses, KITTI (with --times) or TUM")
     parser.add_argument(
         "--sigma-translation",
-        type=_positive,
+        type=positive_number,
         default=SIGMA_TRANSLATION_M,
         metavar="M",
         help="standard deviation of a pair's translation, per axis, in metres (default %(default)s: a published "
@@ -89,15 +138,70 @@ def _add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sigma-rotation",
-        type=_positive,
+        type=positive_number,
         default=SIGMA_ROTATION_RAD,
         metavar="RAD",
         help="standard deviation of a pair's rotation, per axis, in radians (default %(default)s, from the same)",
     )
-    _add_out(parser)
 
 
-def _positive(text: str) -> float:
+def _add_folder_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = """Images and depth are named by their stamp in nanoseconds (.png, .jpg), on the clock of
+        the IMU table."""
+    parser.add_argument("--images", type=Path, required=True, metavar="DIR", help="grey or colour images")
+    parser.add_argument(
+        "--depth", type=Path, required=True, metavar="DIR", help="16-bit PNG registered to the images, 0 where unknown"
+    )
+    parser.add_argument(
+        "--camera",
+        type=Path,
+        required=True,
+        metavar="FILE.yaml",
+        help="intrinsics, lens, mounting of the IMU if it is there; of OpenCV, ROS, EuRoC, Kalibr or ORB-SLAM",
+    )
+    parser.add_argument(
+        "--imu", type=Path, metavar="FILE.csv", help="EuRoC's columns: stamp in ns, gyro, accelerometer"
+    )
+    parser.add_argument("--ground-truth", type=Path, metavar="FILE.tum", help="true poses of the camera, TUM format")
+    parser.add_argument(
+        "--depth-scale",
+        type=positive_number,
+        default=0.001,
+        metavar="M",
+        help="metres per unit of depth (default %(default)s; 0.0002 for TUM RGB-D)",
+    )
+    _add_framing_arguments(parser)
+
+
+def positive_integer(text: str) -> int:
+    """An integer above zero, as an argument."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """``480x128`` as (width, height)."""
+    width, separator, height = text.partition("x")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r} is not WIDTHxHEIGHT")
+    return positive_integer(width), positive_integer(height)
+
+
+def frame_range(text: str) -> slice:
+    """``A:B`` as a slice, either end may be left out."""
+    start, separator, end = text.partition(":")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r} is not FIRST:END")
+    bounds = [int(bound) if bound else None for bound in (start, end)]
+    if any(bound is not None and bound < 0 for bound in bounds):
+        raise argparse.ArgumentTypeError(f"{text!r} counts from the end")
+    return slice(*bounds)
+
+
+def positive_number(text: str) -> float:
+    """A finite number above zero, as an argument."""
     value = float(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
@@ -117,7 +221,44 @@ def _convert(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _open_odometry(args: argparse.Namespace) -> Recording:
+    from fusion_io import kitti
+
+    return kitti.open_odometry(
+        args.root, args.sequence, imu=args.imu, frames=args.frames, colour=args.colour, framing=_framing(args)
+    )
+
+
+def _open_raw(args: argparse.Namespace) -> Recording:
+    from fusion_io import kitti
+
+    return kitti.open_raw(
+        args.drive, args.calib, frames=args.frames, colour=args.colour, gnss=args.gnss, framing=_framing(args)
+    )
+
+
+def _open_folder(args: argparse.Namespace) -> Recording:
+    from fusion_io.folder import open_folder
+
+    return open_folder(
+        args.images,
+        args.depth,
+        args.camera,
+        imu=args.imu,
+        ground_truth=args.ground_truth,
+        metres_per_unit=args.depth_scale,
+        framing=_framing(args),
+    )
+
+
+def _framing(args: argparse.Namespace) -> Framing:
+    from fusion_io.images import Framing
+
+    return Framing(args.crop_height, args.resize)
+
+
 def _open_trajectory(args: argparse.Namespace) -> Recording:
+    from fusion_io.folder import read_imu_csv
     from fusion_io.kitti import read_imu_mat
     from fusion_io.recording import Recording
     from fusion_io.trajectory_files import pair_estimates, read_times, read_trajectory
@@ -128,7 +269,9 @@ def _open_trajectory(args: argparse.Namespace) -> Recording:
     recording.pairs = pair_estimates(poses, args.sigma_translation, args.sigma_rotation)
     if args.ground_truth is not None:
         recording.ground_truth = read_trajectory(args.ground_truth, stamps_ns)
-    if args.imu is not None:
+    if args.imu is not None and args.imu.suffix.lower() == ".csv":
+        recording.imu = read_imu_csv(args.imu, recording.warnings)
+    elif args.imu is not None:
         if stamps_ns is None:
             raise UsageError(f"{args.imu}: has no times of its own: give --times")
         recording.imu = read_imu_mat(args.imu, stamps_ns)
@@ -139,13 +282,22 @@ def _provenance(args: argparse.Namespace) -> dict[str, str]:
     """What made the log: kind and arguments (of paths only the name: logs must not differ by machine), version."""
     from importlib.metadata import version
 
-    values = {name: value for name, value in vars(args).items() if name not in {"run", "open", "out"}}
-    texts = {
-        name: value.resolve().name if isinstance(value, Path) else str(value)
-        for name, value in values.items()
-        if value is not None
-    }
-    return {"version": version("violearner-fusion"), **texts}
+    left_out = {"run", "open", "out"}
+    given = {name: value for name, value in vars(args).items() if name not in left_out and value is not None}
+    return {"version": version("violearner-fusion"), **{name: _text(value) for name, value in given.items()}}
+
+
+def _text(value: object) -> str:
+    """An argument as it was written, but of a path only the name."""
+    match value:
+        case Path():
+            return value.resolve().name
+        case slice():
+            return ":".join("" if bound is None else str(bound) for bound in (value.start, value.stop))
+        case (width, height):
+            return f"{width}x{height}"
+        case _:
+            return str(value)
 
 
 def _summary(recording: Recording) -> str:

@@ -16,34 +16,36 @@ from fusion_io.records import CameraInfo
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path) -> NDArray[np.uint8] | None:
     """An image file as it left the camera: (H, W) or (H, W, 3) uint8, colour as RGB; more bits are cut to 8.
 
-    A ``LogError`` where it cannot be decoded.
+    None where it cannot be read or decoded.
     """
     image = _decode(path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        return None
     return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def read_depth(path: Path, metres_per_unit: float) -> NDArray[np.float32]:
+def read_depth(path: Path, metres_per_unit: float) -> NDArray[np.float32] | None:
     """A 16-bit depth image in metres, (H, W) float32, 0 where there is none.
 
-    A ``LogError`` where it cannot be decoded or is no 16-bit image of one channel.
+    None where it cannot be read or decoded; a ``LogError`` where it is no 16-bit image of one channel.
     """
     depth = _decode(path, cv2.IMREAD_UNCHANGED)
+    if depth is None:
+        return None
     if depth.dtype != np.uint16 or depth.ndim != 2:
         raise LogError(f"{path}: depth must be a 16-bit image of one channel, this is {depth.dtype} {depth.shape}")
     return depth.astype(np.float32) * np.float32(metres_per_unit)
 
 
-def _decode(path: Path, flags: int) -> NDArray[np.generic]:
+def _decode(path: Path, flags: int) -> NDArray[np.generic] | None:
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise LogError(f"{path}: {error.strerror or error}") from None
+    except OSError:
+        return None
     image: NDArray[np.generic] | None = cv2.imdecode(data, flags) if data.size else None
-    if image is None:
-        raise LogError(f"{path}: not an image that can be decoded")
     return image
 
 
@@ -85,3 +87,7 @@ class Framing:
             return image
         resized: NDArray[np.generic] = cv2.resize(image, self.size, interpolation=interpolation)
         return resized
+
+
+#: Nothing is cropped or scaled.
+WHOLE = Framing()

@@ -20,11 +20,19 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.errors import LogError, UsageError
-from fusion_io.images import SUFFIXES, Framing
-from fusion_io.recording import Recording, between, is_later
+from fusion_io.images import SUFFIXES, WHOLE, Framing
+from fusion_io.inertial import longest_increasing
+from fusion_io.recording import Recording, between
 from fusion_io.records import NANOSECONDS, FloatArray, GnssFix, ImuSeries, IntArray, Trajectory
 from fusion_io.stereo import StereoPair, StereoRig, stereo_frames
-from fusion_io.trajectory_files import read_kitti, read_rows, read_text, read_times
+from fusion_io.trajectory_files import (
+    ROTATION_TOLERANCE,
+    read_kitti,
+    read_rows,
+    read_text,
+    read_times,
+    rotation_error,
+)
 
 #: IMU rows from one frame to the next in the odometry benchmark's IMU files.
 IMU_ROWS_PER_FRAME = 10
@@ -58,7 +66,7 @@ def open_odometry(
     imu: Path | None = None,
     frames: slice = slice(None),
     colour: bool = False,
-    framing: Framing = Framing(),
+    framing: Framing = WHOLE,
 ) -> Recording:
     """A sequence of the odometry benchmark in its official layout.
 
@@ -137,7 +145,7 @@ def open_raw(
     frames: slice = slice(None),
     colour: bool = False,
     gnss: bool = False,
-    framing: Framing = Framing(),
+    framing: Framing = WHOLE,
 ) -> Recording:
     """A raw drive (``..._sync``), with its OXTS unit as IMU and as ground truth.
 
@@ -152,7 +160,7 @@ def open_raw(
     left, right = (drive / f"image_{camera:02d}" for camera in cameras)
     times = left / "timestamps.txt"
     stamps_ns = read_timestamps(times)
-    if not is_later(stamps_ns).all():
+    if not (np.diff(stamps_ns) > 0).all():
         raise LogError(f"{times}: the times do not increase")
     cam_to_cam = calibration / "calib_cam_to_cam.txt"
     matrices = read_calibration(cam_to_cam)
@@ -229,11 +237,12 @@ class Oxts:
 
     def gnss(self) -> list[GnssFix]:
         """Positions with the unit's own estimate of their accuracy, taken as equal in all directions."""
-        positions = self.values[:, [_LATITUDE, _LONGITUDE, _ALTITUDE]].tolist()
-        accuracies = self.values[:, _POSITION_ACCURACY]
+        values = self.values[:, [_LATITUDE, _LONGITUDE, _ALTITUDE, _POSITION_ACCURACY]].tolist()
         return [
-            GnssFix(stamp_ns, *position, covariance=accuracy**2 * np.eye(3))
-            for stamp_ns, position, accuracy in zip(self.stamps_ns.tolist(), positions, accuracies, strict=True)
+            GnssFix(stamp_ns, latitude_deg, longitude_deg, altitude_m, accuracy_m**2 * np.eye(3))
+            for stamp_ns, (latitude_deg, longitude_deg, altitude_m, accuracy_m) in zip(
+                self.stamps_ns.tolist(), values, strict=True
+            )
         ]
 
 
@@ -247,9 +256,9 @@ def _read_oxts(folder: Path, warnings: Counter[str]) -> Oxts:
         raise LogError(f"{data}: holds no OXTS record")
     stamps_ns = stamps_ns[on_disk]
     values = np.array([_read_oxts_record(files[index]) for index in on_disk])
-    later = is_later(stamps_ns)
-    _count(warnings, "OXTS records dropped because their time does not increase", int((~later).sum()))
-    return Oxts(stamps_ns[later], values[later])
+    increasing = longest_increasing(stamps_ns)
+    _count(warnings, "OXTS records dropped (their time does not increase)", len(stamps_ns) - len(increasing))
+    return Oxts(stamps_ns[increasing], values[increasing])
 
 
 def _read_oxts_record(path: Path) -> list[float]:
@@ -298,7 +307,7 @@ def _matrix(path: Path, matrices: Mapping[str, FloatArray], name: str, shape: tu
 
 def _rotation(path: Path, matrices: Mapping[str, FloatArray], name: str) -> Rotation:
     matrix = _matrix(path, matrices, name, (3, 3))
-    if np.linalg.det(matrix) <= 0 or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+    if rotation_error(matrix) > ROTATION_TOLERANCE:
         raise LogError(f"{path}: {name} is not a rotation")
     return Rotation.from_matrix(matrix)
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fusion_io.errors import LogError
 from fusion_io.progress import track
-from fusion_io.records import CameraFrame, GnssFix, ImuSeries, IntArray, PairEstimate, Trajectory
+from fusion_io.records import CameraFrame, GnssFix, ImuSeries, PairEstimate, Trajectory
 from fusion_io.writer import LogWriter
 
 
@@ -65,12 +65,6 @@ class Recording:
             if self.frame_count and not written:
                 raise LogError(f"{path}: not written, because no image could be decoded")
             self.frame_count = written
-
-
-def is_later(stamps_ns: IntArray) -> NDArray[np.bool_]:
-    """Which stamps (N,) are later than all before them: what is left is strictly increasing."""
-    latest = np.maximum.accumulate(stamps_ns)
-    return np.append(True, stamps_ns[1:] > latest[:-1])[: len(stamps_ns)]
 
 
 def between(imu: ImuSeries, start_ns: int, end_ns: int) -> ImuSeries:

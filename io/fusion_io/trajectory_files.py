@@ -22,8 +22,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion_io.errors import LogError, UsageError
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, PairEstimate, Trajectory
 
-#: How far an entry of a rotation may be from the nearest rotation (or a quaternion's norm from 1) before
-#: it counts as wrong rather than as rounded: three decimals are enough.
+#: How far a matrix may be from a rotation (or a quaternion's norm from 1) before it counts as wrong rather
+#: than as rounded: three decimals are enough.
 ROTATION_TOLERANCE = 5e-3
 
 #: Stamps beyond this do not fit into 64 bits of nanoseconds (the year 2262).
@@ -77,7 +77,7 @@ def read_text(path: Path) -> str:
         raise LogError(f"{path}: {error.strerror or error}") from None
 
 
-def read_rows(path: Path, columns: Sequence[int] = (), separator: str | None = None) -> list[Row]:
+def read_rows(path: Path, columns: Sequence[int], separator: str | None = None) -> list[Row]:
     """The lines of a table, comments and blanks left out; ``columns`` are the allowed numbers of words.
 
     All lines must have the same number of words, and there must be at least one line.
@@ -86,10 +86,10 @@ def read_rows(path: Path, columns: Sequence[int] = (), separator: str | None = N
     rows = [Row(path, number, line.split(separator)) for number, line in lines if line and not line.startswith("#")]
     if not rows:
         raise LogError(f"{path}: holds no data")
-    allowed = [n for n in columns if n == len(rows[0].words)] if columns else [len(rows[0].words)]
+    allowed = [count for count in columns if count == len(rows[0].words)] or columns
     for row in rows:
         if len(row.words) not in allowed:
-            wanted = " or ".join(map(str, allowed or columns))
+            wanted = " or ".join(map(str, allowed))
             raise row.error(f"{len(row.words)} columns where {wanted} are expected")
     return rows
 
@@ -129,18 +129,10 @@ def read_times(path: Path) -> IntArray:
 # ----------------------------------------------------------------------------------------------------- poses
 
 
-def _valid_rotations(rows: Sequence[Row], matrices: FloatArray) -> FloatArray:
-    """Matrices (N, 3, 3) moved to the nearest rotations; refused where that is far (or a reflection)."""
-    determinants = np.linalg.det(matrices)
-    bad = np.flatnonzero(~(determinants > 0))
-    if bad.size:
-        raise rows[bad[0]].error(f"not a rotation (determinant {determinants[bad[0]]:.3g})")
-    rotations = np.asarray(Rotation.from_matrix(matrices).as_matrix(), dtype=np.float64)
-    deviations = np.abs(rotations - matrices).max(axis=(1, 2))
-    far = np.flatnonzero(deviations > ROTATION_TOLERANCE)
-    if far.size:
-        raise rows[far[0]].error(f"not a rotation (an entry is {deviations[far[0]]:.3g} off)")
-    return rotations
+def rotation_error(matrices: FloatArray) -> FloatArray:
+    """How far matrices (..., 3, 3) are from rotations: the largest |singular value - 1|, infinite for a reflection."""
+    error = np.abs(np.linalg.svd(matrices, compute_uv=False) - 1).max(axis=-1)
+    return np.where(np.linalg.det(matrices) > 0, error, np.inf)
 
 
 def read_indexed_kitti_poses(path: Path) -> tuple[IntArray | None, FloatArray]:
@@ -155,7 +147,11 @@ def read_indexed_kitti_poses(path: Path) -> tuple[IntArray | None, FloatArray]:
     frames = _frame_indices(rows, numbers[:, 0]) if numbers.shape[1] == 13 else None
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = numbers[:, -12:].reshape(-1, 3, 4)
-    poses[:, :3, :3] = _valid_rotations(rows, poses[:, :3, :3])
+    errors = rotation_error(poses[:, :3, :3])
+    bad = np.flatnonzero(errors > ROTATION_TOLERANCE)
+    if bad.size:
+        raise rows[bad[0]].error(f"not a rotation (off by {errors[bad[0]]:.2g})")
+    poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
     return frames, poses
 
 

@@ -13,7 +13,7 @@ from fusion_io.records import FloatArray
 from fusion_io.simulation.street import Path, Polygons, _padded, _planes
 from fusion_io.simulation.textures import Float32, Surface
 
-CELL_METRES = 8.0  # of the net
+CELL_METRES = 10.0  # of the net
 REACH_METRES = 56.0  # the ground ends this far from the path; beyond is the backdrop
 TILE_CELLS = 16  # a tile of the map is 16 m wide: road coordinates on a grid of 1 m
 SHADE_CELLS = 64  # and sunlight on one of 0.25 m
@@ -45,7 +45,7 @@ def build_ground(path: Path) -> Polygons:
 def _cells_near(path: Path, cell: float, reach: float) -> NDArray[np.int64]:
     """Indices (N, 2) of the square cells within reach of the path, sorted."""
     span = int(np.ceil(reach / cell))
-    window = np.stack(np.mgrid[-span : span + 1, -span : span + 1], axis=-1).reshape(-1, 2)
+    window = np.indices((2 * span + 1, 2 * span + 1)).reshape(2, -1).T - span
     stations = np.unique(np.floor(path.points / cell).astype(np.int64), axis=0)
     cells = np.unique((stations[:, None] + window).reshape(-1, 2), axis=0)
     distance, _ = path.tree.query((cells + 0.5) * cell)
@@ -108,7 +108,7 @@ def _sunlight(tiles: NDArray[np.int64], shadows: Sequence[FloatArray]) -> Float3
     sixteenths = 4  # OpenCV's shift: corners in sixteenths of a cell
     for slot, tile in enumerate(tiles * TILE_CELLS):
         touching = np.all((bounds[:, 0] < tile + TILE_CELLS) & (bounds[:, 1] > tile), axis=1)
-        for index in np.flatnonzero(touching):
+        for index in np.flatnonzero(touching).tolist():
             cells = (shadows[index] - tile)[:, ::-1] * (scale * 2**sixteenths)
             cv2.fillConvexPoly(light[slot], np.rint(cells).astype(np.int32), 0.0, cv2.LINE_8, sixteenths)
     return light
@@ -118,7 +118,7 @@ class _Corners:
     """The four grid points about places in tiles, for bilinear interpolation of several layers."""
 
     def __init__(self, slot: NDArray[np.int32], x: Float32, y: Float32, cells: int) -> None:
-        """slot (N,) tiles; x, y (N,) fractions of a tile; cells: of the grid along a side."""
+        """Tiles ``slot`` (N,); x, y (N,) fractions of a tile; cells: of the grid along a side."""
         x, y = x * np.float32(cells), y * np.float32(cells)
         column = np.minimum(x.astype(np.int32), cells - 1)
         row = np.minimum(y.astype(np.int32), cells - 1)
@@ -135,5 +135,4 @@ class _Corners:
         high += self._y * (flat[self._start + (self._stride + 1)] - high)
         high -= low
         high *= self._x
-        low += high
-        return low
+        return np.asarray(low + high)

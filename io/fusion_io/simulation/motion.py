@@ -31,15 +31,19 @@ class Motion:
     """
 
     def __init__(self, times_s: FloatArray, poses: RigidTransform) -> None:
-        """times_s (N,) increasing, N >= 6; poses N transforms T_world_camera."""
+        """Through N >= 2 poses T_world_camera at times_s (N,), increasing; below N = 6 of lower degree."""
         self.start_s, self.end_s = float(times_s[0]), float(times_s[-1])
-        self._position = make_interp_spline(times_s, poses.translation, k=5)
+        self._position = make_interp_spline(times_s, poses.translation, k=min(5, len(times_s) - 1))
         self._acceleration = self._position.derivative(2)
         self._rotation = RotationSpline(times_s, poses.rotation)
 
     def poses(self, times_s: FloatArray) -> RigidTransform:
         """T_world_camera at the times (N,)."""
         return RigidTransform.from_components(self._position(times_s), self._rotation(times_s))
+
+    def sampled(self) -> RigidTransform:
+        """The poses from start to end, every 50 ms or a little less."""
+        return self.poses(np.linspace(self.start_s, self.end_s, int((self.end_s - self.start_s) / 0.05) + 2))
 
     def angular_velocity(self, times_s: FloatArray) -> FloatArray:
         """(N, 3) rad/s, camera axes."""
@@ -56,12 +60,11 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class ImuModel:
-    """How the IMU is mounted and what is wrong with it.
+    """How an IMU is mounted and what is wrong with it.
 
-    rotation_imu_camera: v_imu = R v_camera. lever_arm: the IMU's place in camera axes, metres.
-    time_offset_s: t_imu = t_camera + offset. Biases (3,) in IMU axes; the standard deviations are
-    those of a sample. The defaults are a good MEMS unit at 100 Hz: the noise densities are
-    1e-4 rad/s/sqrt(Hz) and 2e-3 m/s^2/sqrt(Hz), times sqrt(100).
+    rotation_imu_camera: v_imu = R v_camera. lever_arm (3,): the IMU's place in camera axes, metres.
+    time_offset_s: t_imu = t_camera + offset. Biases (3,) are constant, in IMU axes; the noise
+    densities are in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). The defaults are those of a good MEMS unit.
     """
 
     rotation_imu_camera: Rotation = ROTATION_IMU_CAMERA_KITTI
@@ -69,18 +72,25 @@ class ImuModel:
     time_offset_s: float = 0.0
     gyro_bias: FloatArray = field(default_factory=lambda: np.array([0.002, -0.003, 0.004]))
     accelerometer_bias: FloatArray = field(default_factory=lambda: np.array([0.03, -0.05, 0.04]))
-    gyro_std: float = 1e-3
-    accelerometer_std: float = 2e-2
+    gyro_noise: float = 1e-4
+    accelerometer_noise: float = 2e-3
 
 
-PERFECT_IMU = ImuModel(gyro_bias=np.zeros(3), accelerometer_bias=np.zeros(3), gyro_std=0.0, accelerometer_std=0.0)
+PERFECT_IMU = ImuModel(gyro_bias=np.zeros(3), accelerometer_bias=np.zeros(3), gyro_noise=0.0, accelerometer_noise=0.0)
 
 
-def simulate_imu(motion: Motion, stamps_ns: IntArray, model: ImuModel, seed: int) -> ImuSeries:
-    """What the IMU shows at stamps_ns (N,) on its own clock; the motion's time is the stamp in seconds less the offset.
+def imu_stamps(start_s: float, end_s: float, rate_hz: float) -> IntArray:
+    """Stamps (N,) in nanoseconds from start (included) to end, at a constant rate."""
+    count = int(np.floor((end_s - start_s) * rate_hz)) + 1
+    return np.rint((start_s + np.arange(count) / rate_hz) * NANOSECONDS).astype(np.int64)
 
-    The specific force at the lever arm l is R' (a - g) + w x (w x l) + w' x l in camera axes
-    (rigid-body kinematics), then rotated into the IMU's.
+
+def simulate_imu(motion: Motion, stamps_ns: IntArray, rate_hz: float, model: ImuModel, seed: int) -> ImuSeries:
+    """What the IMU shows at stamps_ns (N,) of its own clock.
+
+    The motion's clock is the camera's, in seconds. With gravity g the specific force at the lever
+    arm l is R'(a - g) + w x (w x l) + w' x l in camera axes (rigid-body kinematics), then turned into
+    the IMU's. A sample's noise has the standard deviation of the density times sqrt(rate).
     """
     rng = np.random.default_rng(seed)
     times = stamps_ns / NANOSECONDS - model.time_offset_s
@@ -89,88 +99,92 @@ def simulate_imu(motion: Motion, stamps_ns: IntArray, model: ImuModel, seed: int
     if np.any(model.lever_arm):
         force += np.cross(rate, np.cross(rate, model.lever_arm))
         force += np.cross(motion.angular_acceleration(times), model.lever_arm)
-    mounting = model.rotation_imu_camera
-    gyro_noise, accelerometer_noise = rng.standard_normal((2, len(times), 3))
+    gyro_std, accelerometer_std = np.sqrt(rate_hz) * np.array([model.gyro_noise, model.accelerometer_noise])
+    gyro_error, accelerometer_error = rng.standard_normal((2, len(times), 3))
+    turn = model.rotation_imu_camera.apply
     return ImuSeries(
         stamps_ns,
-        mounting.apply(rate) + model.gyro_bias + model.gyro_std * gyro_noise,
-        mounting.apply(force) + model.accelerometer_bias + model.accelerometer_std * accelerometer_noise,
-        model.gyro_std,
-        model.accelerometer_std,
+        turn(rate) + model.gyro_bias + gyro_std * gyro_error,
+        turn(force) + model.accelerometer_bias + accelerometer_std * accelerometer_error,
+        float(gyro_std),
+        float(accelerometer_std),
     )
+
+
+MAX_YAW_RATE = 0.5  # rad/s
+MAX_LATERAL_ACCELERATION = 4.0  # m/s^2
+CAMERA_AHEAD_METRES = 1.7  # of the rear axle, which is what follows the road
+KNOT_SECONDS = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class DriveStyle:
-    """The statistics of a drive.
+    """The statistics of a drive; the defaults look like KITTI's residential streets.
 
-    speed_mps: the speed it wanders about. speed_change: standard deviation of the wandering in m/s.
-    yaw_rate: standard deviation in rad/s. shake: a factor on pitch, roll and heave of the car's
-    body. slope: standard deviation of the road's gradient. camera_height_m over the road,
-    camera_pitch_rad (downwards positive), camera_roll_rad and camera_yaw_rad of the mounting.
+    The speed wanders about speed_mps with a standard deviation of speed_change_mps; yaw_rate and
+    slope are the standard deviations of the yaw rate in rad/s and of the road's gradient. shake is
+    a factor on pitch, roll and heave of the car's body. The camera is mounted camera_height_m over
+    the road, turned by pitch (downwards positive), roll and yaw.
     """
 
     speed_mps: float = 9.0
     speed_change_mps: float = 2.0
-    yaw_rate: float = 0.08
+    yaw_rate: float = 0.12
     shake: float = 1.0
-    slope: float = 0.015
+    slope: float = 0.01
     camera_height_m: float = 1.65
     camera_pitch_rad: float = 0.0
     camera_roll_rad: float = 0.0
     camera_yaw_rad: float = 0.0
 
 
-MAX_YAW_RATE = 0.35  # rad/s
-MAX_LATERAL_ACCELERATION = 4.0  # m/s^2
-KNOT_SECONDS = 0.05
-
-
-def _wander(rng: np.random.Generator, count: int, period_s: float) -> FloatArray:
-    """A smooth random signal (count,) at the knots with unit variance, whose features last about period_s."""
-    sigma = 0.25 * period_s / KNOT_SECONDS
-    margin = int(4 * sigma) + 1
-    white = rng.standard_normal(count + 2 * margin)
-    smooth = gaussian_filter1d(white, sigma, mode="nearest")[margin : margin + count]
-    return np.asarray(smooth * np.sqrt(2.0 * np.sqrt(np.pi) * sigma))
-
-
 def drive(seed: int, start_s: float, end_s: float, style: DriveStyle) -> Motion:
-    """A car's drive from start_s to end_s, beginning at the world's origin and heading along x.
+    """A car's drive from start_s to end_s, the rear axle beginning at the world's origin, heading along x.
 
-    Speed and yaw rate wander; the yaw rate is bounded by the tyres (lateral acceleration) and by
-    MAX_YAW_RATE. The body pitches, rolls and heaves by a fraction of a degree and of a decimetre,
-    dives under braking, and follows the gradient of the road.
+    Speed and yaw rate wander; the yaw rate is bounded by MAX_YAW_RATE and by what the tyres hold.
+    The body pitches, rolls and heaves, dives under braking, and follows the gradient of the road.
     """
     rng = np.random.default_rng(seed)
-    count = int(np.ceil((end_s - start_s) / KNOT_SECONDS)) + 1
-    times = start_s + KNOT_SECONDS * np.arange(count)
+    count = max(int(np.ceil((end_s - start_s) / KNOT_SECONDS)) + 1, 6)
+    times = np.asarray(start_s + KNOT_SECONDS * np.arange(count), np.float64)
 
     speed = np.maximum(style.speed_mps + style.speed_change_mps * _wander(rng, count, 8.0), 0.0)
-    speed = gaussian_filter1d(speed, 0.3 / KNOT_SECONDS, mode="nearest") if speed.any() else speed
+    speed = gaussian_filter1d(speed, 0.3 / KNOT_SECONDS, mode="nearest")  # stopping and starting takes time
     limit = np.minimum(MAX_YAW_RATE, MAX_LATERAL_ACCELERATION / np.maximum(speed, 1e-3))
     grip = np.minimum(speed / 2.0, 1.0)  # a standing car does not turn
     yaw_rate = grip * limit * np.tanh(style.yaw_rate * _wander(rng, count, 6.0) / limit)
     gradient = style.slope * _wander(rng, count, 12.0)
 
-    yaw = _integrate(yaw_rate)
-    x, y = _integrate(speed * np.cos(yaw)), _integrate(speed * np.sin(yaw))
-    road_height = _integrate(speed * gradient)
-    acceleration = np.gradient(speed, KNOT_SECONDS)
+    yaw = _integral(yaw_rate)
+    axle = np.column_stack(
+        [_integral(speed * np.cos(yaw)), _integral(speed * np.sin(yaw)), _integral(speed * gradient)]
+    )
 
     liveliness = style.shake * np.minimum(0.15 + speed / 8.0, 1.5)
-    pitch = liveliness * (0.004 * _wander(rng, count, 1.6) + 0.0015 * _wander(rng, count, 0.6))
-    roll = liveliness * (0.005 * _wander(rng, count, 2.0) + 0.0015 * _wander(rng, count, 0.6))
-    heave = liveliness * (0.015 * _wander(rng, count, 1.6) + 0.003 * _wander(rng, count, 0.6))
-    body_pitch = gaussian_filter1d(-gradient - 0.003 * acceleration, 0.2 / KNOT_SECONDS, mode="nearest") + pitch
-    body_roll = roll + 0.004 * yaw_rate * speed
+    pitch, roll, heave = (
+        liveliness * (slow * _wander(rng, count, 1.6) + fast * _wander(rng, count, 0.6))
+        for slow, fast in ((0.006, 0.002), (0.007, 0.002), (0.012, 0.003))
+    )
+    dive = 0.003 * np.gradient(speed, KNOT_SECONDS)
+    pitch -= gaussian_filter1d(gradient + dive, 0.2 / KNOT_SECONDS, mode="nearest")
+    roll += 0.004 * yaw_rate * speed  # leaning out of the bend
 
-    body = Rotation.from_euler("ZYX", np.column_stack([yaw, body_pitch, body_roll]))
+    body = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
     mounting = Rotation.from_euler("ZYX", [style.camera_yaw_rad, style.camera_pitch_rad, style.camera_roll_rad])
-    positions = np.column_stack([x, y, road_height + style.camera_height_m + heave])
+    positions = axle + body.apply([CAMERA_AHEAD_METRES, 0.0, style.camera_height_m])
+    positions[:, 2] += heave
     return Motion(times, RigidTransform.from_components(positions, body * mounting * ROTATION_WORLD_CAMERA_LEVEL))
 
 
-def _integrate(rate: FloatArray) -> FloatArray:
+def _wander(rng: np.random.Generator, count: int, period_s: float) -> FloatArray:
+    """A smooth random signal (count,) at the knots, of unit variance, whose features last about period_s."""
+    sigma = 0.25 * period_s / KNOT_SECONDS
+    margin = int(4 * sigma) + 1
+    white = rng.standard_normal(count + 2 * margin)
+    smooth = gaussian_filter1d(white, sigma)[margin : margin + count]
+    return np.asarray(smooth * np.sqrt(2.0 * np.sqrt(np.pi) * sigma), np.float64)
+
+
+def _integral(rate: FloatArray) -> FloatArray:
     """The integral from the first knot, by trapezoids."""
     return np.concatenate([[0.0], np.cumsum(0.5 * KNOT_SECONDS * (rate[1:] + rate[:-1]))])

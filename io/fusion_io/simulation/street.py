@@ -25,6 +25,7 @@ ROAD_BEHIND_METRES = 30.0  # the road goes on, straight, before the path's start
 ROAD_AHEAD_METRES = 130.0  # and after its end
 REVISIT_METRES = 7.0  # a path this close to an earlier part of itself runs on the same road
 REVISIT_GAP_METRES = 25.0  # along the path: less than this is not a revisit but the same passage
+CROSSING_METRES = 12.0  # passages this close to each other share the ground
 LOT_METRES = 13.0  # along the street: one house or garden a side
 HOUSE_CLEARANCE = 3.0  # metres from the camera's path
 THING_CLEARANCE = 1.7
@@ -106,8 +107,21 @@ class Path:
         self.normals = np.column_stack([-self.tangents[:, 1], self.tangents[:, 0]])
         self.tree = cKDTree(self.points)
         self.is_new = self._find_new()
-        self._heights = ground[::HEIGHT_STRIDE, 2]
         self._heights_tree = cKDTree(ground[::HEIGHT_STRIDE, :2])
+        self._heights = self._lowest(ground[::HEIGHT_STRIDE, 2])
+
+    def _lowest(self, heights: FloatArray) -> FloatArray:
+        """The heights (N,), or those of another passage nearby that is lower.
+
+        A recorded path may come back to a place at another height, by drift or over a bridge. The
+        ground must then be below both.
+        """
+        gap = REVISIT_GAP_METRES / (HEIGHT_STRIDE * STATION_METRES)
+        lowest = heights.copy()
+        for i, j in self._heights_tree.query_pairs(CROSSING_METRES, output_type="ndarray"):
+            if abs(i - j) > gap:
+                lowest[i], lowest[j] = min(lowest[i], heights[j]), min(lowest[j], heights[i])
+        return lowest
 
     def _find_new(self) -> NDArray[np.bool_]:
         gap = int(REVISIT_GAP_METRES / STATION_METRES)
@@ -232,7 +246,7 @@ def _dodecahedron() -> FloatArray:
         right = np.cross(normal, [0.1, 0.7, 0.3])  # any direction but the normal's
         up = np.cross(normal, right) / np.linalg.norm(normal)
         faces.append(face[np.argsort(np.arctan2(face @ up, face @ right))])
-    return np.array(faces) / np.sqrt(3)
+    return np.asarray(np.array(faces) / np.sqrt(3))
 
 
 DODECAHEDRON = _dodecahedron()
@@ -370,8 +384,9 @@ class Builder:
         # Wheels, lamps and plates are faces of boxes a little wider or longer than the body.
         axles = np.array([[x * length, 0.0, 0.0] for x in (-0.31, -0.31, 0.31, 0.31)])
         sides = (RIGHT, LEFT, RIGHT, LEFT)
-        self._boxes(site, sides, (0.6, width + 0.02, 0.6), axles + [0, 0, 0.02], Surface.PLAIN, black)
-        self._boxes(site, sides, (0.3, width + 0.04, 0.3), axles + [0, 0, 0.17], Surface.PLAIN, hub)
+        self._boxes(site, sides, (0.6, width + 0.02, 0.6), axles, Surface.PLAIN, black)
+        axles[:, 2] = 0.15
+        self._boxes(site, sides, (0.3, width + 0.04, 0.3), axles, Surface.PLAIN, hub)
         lamps = np.array([[0.0, y * width, 0.6] for y in (-0.36, 0.36)])
         self._boxes(site, (FRONT, FRONT), (length + 0.02, 0.3, 0.16), lamps, Surface.PLAIN, white)
         self._boxes(site, (BACK, BACK), (length + 0.02, 0.3, 0.16), lamps, Surface.PLAIN, red)

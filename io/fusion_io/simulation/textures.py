@@ -165,7 +165,10 @@ class Textures:
         self._sizes = (TILE_TEXELS >> np.arange(LEVELS)).astype(np.float32)
 
     def lookup(self, surface: NDArray[np.int32], u: Float32, v: Float32, octave: Float32) -> Float32:
-        """Albedo (N,) at u, v (N,) metres on the tiles ``surface`` (N,) or (1,), averaged over 2**octave (N,) metres."""
+        """Albedo (N,) at u, v (N,) metres on the tiles ``surface`` (N,) or (1,).
+
+        It is the average over about 2**octave (N,) metres.
+        """
         level = np.clip(octave - np.float32(np.log2(TEXEL_METRES)), 0.0, LEVELS - 1.001).astype(np.float32)
         lower = level.astype(np.int32)
         u = u * np.float32(1 / TILE_METRES)
@@ -187,11 +190,10 @@ class Textures:
         rows = self._rows[entry] + size * v
         # remap takes images whose sides are below 2^15: fold the samples into rows of a thousand.
         count, fold = len(u), 1024
-        padded = max(-(-count // fold), 1) * fold
-        maps = np.zeros((2, padded), np.float32)
-        maps[0, :count], maps[1, :count] = columns, rows
-        maps = maps.reshape(2, -1, fold)
-        return np.asarray(cv2.remap(self._image, maps[0], maps[1], cv2.INTER_LINEAR), np.float32).ravel()[:count]
+        maps = np.zeros((2, max(-(-count // fold), 1), fold), np.float32)
+        maps[0].ravel()[:count], maps[1].ravel()[:count] = columns, rows
+        values = cv2.remap(self._image, maps[0], maps[1], cv2.INTER_LINEAR)
+        return np.asarray(values, np.float32).ravel()[:count]
 
 
 @cache

@@ -67,7 +67,9 @@ class World:
         ]
         return np.concatenate(cells) if cells else np.zeros(0, np.int64)
 
-    def _shade(self, view: _View, hits: NDArray[np.int32], inverse_depth: Float32, K: FloatArray, colour: bool) -> Float32:
+    def _shade(
+        self, view: _View, hits: NDArray[np.int32], inverse_depth: Float32, K: FloatArray, colour: bool
+    ) -> Float32:
         """Radiance of every sample: the surface's albedo at the ray's end times its tint and light."""
         channels = 3 if colour else 1
         height, width = hits.shape
@@ -123,12 +125,23 @@ class World:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         up = rays[:, 2]
         above = np.maximum(up, 0.02)
-        spread = 6.0 / (above + 0.3)
+        spread = np.float32(6.0) / (above + np.float32(0.3))
         octave = np.full(len(up), -3.0, np.float32)
         cloud = library().lookup(PATCHES, rays[:, 0] * spread, rays[:, 1] * spread, octave)
         sky = np.float32(self.look.sky) * (1.0 - 0.5 * above) + 0.4 * (cloud - 0.5)
         haze = np.float32(0.35 * self.look.sky)
         return np.asarray(haze + np.clip(up / 0.02 + 0.5, 0.0, 1.0) * (sky - haze), np.float32)
+
+
+def exposure(radiance: Float32) -> float:
+    """The gain that an automatic exposure picks: the median goes a bit below mid grey."""
+    return 0.42 / float(np.median(radiance))
+
+
+def exposed(radiance: Float32, gain: float, error: Float32 | float = 0.0) -> NDArray[np.uint8]:
+    """The image of a radiance: a linear sensor that saturates. error is in grey levels."""
+    levels = np.rint(radiance * np.float32(255.0 * gain) + error)
+    return np.asarray(np.clip(levels, 0, 255), np.uint8)
 
 
 def _rays(K: FloatArray, width: int, pixels: NDArray[np.int64]) -> Float32:
@@ -166,8 +179,8 @@ class _View:
         corners = (polygons.corners[candidates] - self.position) @ self.rotation
         # A polygon is out of sight if all its corners are outside of one side of the view's pyramid.
         sides = np.array([[1, 0, 1], [-1, 0, width], [0, 1, 1], [0, -1, height], [0, 0, 1]]) @ K
-        outside = corners @ sides.T < 0
-        seen = ~outside.all(axis=1).any(axis=1)
+        outside = np.all(corners @ sides.T < 0, axis=1)
+        seen = ~np.any(outside, axis=1)
         # Nor is it if it is smaller than a pixel's half, but for the ground, where holes would show.
         distance = np.linalg.norm(corners, axis=2).min(axis=1)
         extent = np.ptp(corners, axis=1).max(axis=1)
@@ -247,7 +260,7 @@ class _View:
     def texture_coordinates(
         self, K: FloatArray, width: int, pixels: NDArray[np.int64], polygon: NDArray[np.int32], inverse: Float32
     ) -> tuple[Float32, Float32]:
-        """u and v, each (N,), in metres on the tile, of flat pixels that see the polygons (N,)."""
+        """Texture coordinates u and v, each (N,), in metres on the tile, of flat pixels that see the polygons (N,)."""
         row, column = np.divmod(pixels.astype(np.int32), np.int32(width))
         row, column = row.astype(np.float32), column.astype(np.float32)
         per_pixel = (self._axes @ np.linalg.inv(K)).astype(np.float32)
