@@ -58,9 +58,9 @@ def plot_errors(title: str, trajectories: Mapping[str, Trajectory], ground_truth
             style = STYLES[name] if ground_truth is None else SIGMA_STYLE | {"color": STYLES[name]["color"]}
             position.plot(seconds, 3.0 * _sigma(trajectory.covariances[:, 3:, 3:]), **style)
             orientation.plot(seconds, 3.0 * np.rad2deg(_sigma(trajectory.covariances[:, :3, :3])), **style)
-    shown = "stated 3 sigma" if ground_truth is None else "error"
-    position.set(title=title, ylabel=f"position, {shown} [m]")
-    orientation.set(xlabel="time since the first frame [s]", ylabel=f"orientation, {shown} [deg]")
+    shown = "stated 3 sigma of the {}" if ground_truth is None else "error of the {}"
+    position.set(title=title, ylabel=f"{shown.format('position')} [m]")
+    orientation.set(xlabel="time since the first frame [s]", ylabel=f"{shown.format('orientation')} [deg]")
     if ground_truth is not None:
         position.plot([], [], label="stated 3 sigma", color="0.3", **SIGMA_STYLE)
     for axes in (position, orientation):

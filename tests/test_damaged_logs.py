@@ -71,15 +71,18 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def whole(sample: Path) -> dict[str, list[tuple[int, bytes]]]:
+    return everything(sample)
+
+
 # --- Laws ---------------------------------------------------------------------------------------
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(data=st.data())
-def test_a_log_cut_anywhere_gives_the_beginning_of_every_topic(data, sample: Path, tmp_path_factory) -> None:
-    whole = everything(sample)
-    size = sample.stat().st_size
-    cut = data.draw(st.integers(0, size - 1))
+def test_a_log_cut_anywhere_gives_the_beginning_of_every_topic(data, sample: Path, whole, tmp_path_factory) -> None:
+    cut = data.draw(st.integers(0, sample.stat().st_size - 1))
     path = tmp_path_factory.mktemp("cut") / "cut.mcap"
     path.write_bytes(sample.read_bytes()[:cut])
     try:
@@ -96,10 +99,9 @@ def test_a_log_cut_anywhere_gives_the_beginning_of_every_topic(data, sample: Pat
     assert len(log.pairs()) == len(left[topics.PAIRS])
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.data())
-def test_a_flipped_bit_loses_what_is_counted_and_changes_nothing(data, sample: Path, tmp_path_factory) -> None:
-    whole = everything(sample)
+def test_a_flipped_bit_loses_what_is_counted_and_changes_nothing(data, sample: Path, whole, tmp_path_factory) -> None:
     damaged = bytearray(sample.read_bytes())
     near_chunk = st.builds(int.__add__, st.sampled_from(chunk_starts(damaged)), st.integers(0, 60))
     position = data.draw(st.one_of(st.integers(0, len(damaged) - 1), near_chunk))
@@ -119,10 +121,11 @@ def test_a_flipped_bit_loses_what_is_counted_and_changes_nothing(data, sample: P
     list(log.frames()), log.imu(), log.pairs()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(start=st.floats(0, 1), garbage=st.binary(min_size=1, max_size=400), cut=st.floats(0.3, 1))
-def test_garbage_over_a_part_of_a_cut_log_never_crashes(start, garbage, cut, sample: Path, tmp_path_factory) -> None:
-    whole = everything(sample)
+def test_garbage_over_a_part_of_a_cut_log_never_crashes(
+    start, garbage, cut, sample: Path, whole, tmp_path_factory
+) -> None:
     damaged = bytearray(sample.read_bytes())
     position = 8 + int(start * (len(damaged) - 8))
     damaged[position : position + len(garbage)] = garbage
@@ -233,13 +236,12 @@ def test_a_flipped_byte_costs_one_chunk(sample: Path, tmp_path: Path) -> None:
     assert any(f"{lost} messages lost" in note and "to 1700000" in note for note in log.notes)
 
 
-def test_the_loss_of_a_chunk_is_counted_without_a_summary_too(sample: Path, tmp_path: Path) -> None:
+def test_the_loss_of_a_chunk_is_counted_without_a_summary_too(sample: Path, whole, tmp_path: Path) -> None:
     def flip_and_cut(data: bytearray) -> bytearray:
         starts = chunk_starts(data)
         data[starts[3] + 5000] ^= 0xFF
         return data[: starts[-1]]
 
-    whole = everything(sample)
     log = open_log(damage(sample, tmp_path, flip_and_cut))
     cut = everything(damage(sample, tmp_path, lambda data: data[: chunk_starts(data)[-1]]))
     left = everything(damage(sample, tmp_path, flip_and_cut))

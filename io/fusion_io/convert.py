@@ -40,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_FAILED
+    except KeyboardInterrupt:
+        print("interrupted: nothing was written", file=sys.stderr)
+        return EXIT_FAILED
 
 
 # ------------------------------------------------------------------------------------------------- arguments

@@ -44,6 +44,7 @@ _CHUNK_START = re.compile(bytes([Opcode.CHUNK]) + rb"(?=.{8}.{28}" + _COMPRESSIO
 _DEFINITIONS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.STATISTICS, Opcode.MESSAGE_INDEX}
 _MAX_DEFINITION_BYTES = 1 << 26
 _LOOSE_BLOCK_BYTES = 1 << 20
+_DATA_END_BYTES = 4
 _HEADER_BYTES = 12
 
 
@@ -126,6 +127,7 @@ class _Scan:
         self._bad_chunks: list[_BadChunk] = []
         self._after_bad_chunk = False
         self._damage: list[Damage] = []
+        self._chunked = False
         self._data_complete = False
         self._at_end = False
 
@@ -176,7 +178,7 @@ class _Scan:
         if opcode == Opcode.CHUNK:
             return self._read_chunk(position)
         end = position + RECORD.size + length
-        if opcode == 0 or end > self._size or (opcode in _DEFINITIONS and length > _MAX_DEFINITION_BYTES):
+        if not self._is_plausible(opcode, length, end):
             raise _BrokenRecordError(f"opcode {opcode} of {length} bytes")
         if opcode == Opcode.MESSAGE:
             self._extend_loose_block(position, end)
@@ -187,6 +189,21 @@ class _Scan:
         elif opcode == Opcode.FOOTER:
             self._read_footer()
         return int(end)
+
+    def _is_plausible(self, opcode: int, length: int, end: int) -> bool:
+        """Whether a record with this head can stand here; without a checksum this is all that guards its opcode."""
+        if opcode in _DEFINITIONS:
+            return length <= _MAX_DEFINITION_BYTES and end <= self._size
+        match opcode:
+            case 0:
+                return False
+            case Opcode.MESSAGE:  # writers put either all messages into chunks or none
+                return not self._chunked and not self._data_complete and end <= self._size
+            case Opcode.DATA_END:
+                return length == _DATA_END_BYTES
+            case Opcode.FOOTER:
+                return end + len(MCAP0_MAGIC) == self._size
+        return end <= self._size
 
     def _read_definition(self, opcode: int, body: bytes) -> None:
         """A record that says what is in the file. What is met first holds: the summary only repeats it."""
@@ -235,6 +252,7 @@ class _Scan:
         if chunk is None:
             raise _BrokenChunkError("not a chunk of this format")
         block = self._block_of(chunk, position)
+        self._chunked = True
         end = block.offset + block.length
         cut = end > self._size
         self._after_bad_chunk = False
