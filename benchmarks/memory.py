@@ -44,7 +44,7 @@ def write_log(path: Path, frames: int) -> None:
     texture = rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
     depth = np.full((HEIGHT, WIDTH), 10.0, dtype=np.float32)
     with LogWriter(path) as log:
-        log.imu(simulate_imu(motion, imu_stamps_ns, ImuModel(), seed=0))
+        log.imu(simulate_imu(motion, imu_stamps_ns, 100.0, ImuModel(), seed=0))
         log.ground_truth(truth)
         log.pairs(pair_estimates(truth, 0.03, 1e-3))
         for k, stamp in enumerate(stamps_ns):

@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.chain import ImuWindow, ImuWindows, stamps_of
+from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import EkfConfig
 from fusion_io.records import FloatArray, ImuSeries, PairEstimate, Trajectory
 
@@ -33,6 +34,11 @@ ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
 CLONE_ATTITUDE, CLONE_POSITION = slice(17, 20), slice(20, 23)
 DIMENSION = 23
+
+# The cross products with the three unit vectors.
+GENERATORS = np.array(
+    [[[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0.0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
 
 # Two small turns of Q move its third column so: Exp(x, y, 0) e3 = e3 + TILT (x, y).
 TILT = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
@@ -86,9 +92,9 @@ class State:
         return motion
 
 
-def exp(vector: FloatArray) -> FloatArray:
-    """The rotation matrix (3, 3) of a rotation vector (3,)."""
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+def exp(vectors: FloatArray) -> FloatArray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
 
 
 def log(matrix: FloatArray) -> FloatArray:
@@ -96,43 +102,49 @@ def log(matrix: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
 
 
-def skew(vector: FloatArray) -> FloatArray:
-    """The matrix (3, 3) of the cross product with a vector (3,)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def skew(vectors: FloatArray) -> FloatArray:
+    """The matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    return np.tensordot(vectors, GENERATORS, axes=1)
 
 
-def right_jacobian(vector: FloatArray) -> FloatArray:
-    """J (3, 3) of Exp(vector + d) = Exp(vector) Exp(J d), to first order in d (Sola, eq. 183)."""
-    angle, cross = float(np.linalg.norm(vector)), skew(vector)
-    if angle < 1e-4:
-        return np.eye(3) - cross / 2 + cross @ cross / 6
-    return np.eye(3) - (1 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross
+def right_jacobian(vectors: FloatArray) -> FloatArray:
+    """J (..., 3, 3) of Exp(vector + d) = Exp(vector) Exp(J d), to first order in d (Sola, eq. 183)."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    small = angle < 1e-3  # there the terms of the series that are left out are below rounding
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5 - angle**2 / 24, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    cross = skew(vectors)
+    return np.asarray(np.eye(3) - first * cross + second * cross @ cross)
 
 
-def propagate(state: State, rate: FloatArray, acceleration: FloatArray, dt: float) -> tuple[State, FloatArray]:
-    """The state after dt seconds of a measured rate and acceleration (3,), and the Jacobian (23, 23) of its error.
+def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
+    """The state after M pieces of IMU, and the Jacobians (M, 23, 23) of its error from piece to piece.
 
-    Both are constant over dt; the acceleration acts with the attitude halfway.
+    Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it.
     """
-    turn = (rate - state.gyro_bias) * dt
-    force = acceleration - state.accelerometer_bias
-    half, step = exp(turn / 2), exp(turn)
-    R_half = state.R @ half
-    gained = (R_half @ force + state.gravity) * dt
-    moved = replace(state, R=state.R @ step, p=state.p + (state.v + gained / 2) * dt, v=state.v + gained)
+    dt = window.durations[:, None]
+    turns = (window.angular_velocity - state.gyro_bias) * dt
+    forces = window.linear_acceleration - state.accelerometer_bias
+    halves, wholes = exp(turns / 2), exp(turns)
+    R = np.stack(list(accumulate(wholes, np.matmul, initial=state.R)))
+    R_half = R[:-1] @ halves
+    gained = (np.einsum("nij,nj->ni", R_half, forces) + state.gravity) * dt
+    v = state.v + np.cumsum(gained, axis=0)
+    p = state.p + np.sum((v - gained / 2) * dt, axis=0)
 
-    by_force = -R_half @ skew(force) * dt
-    F = np.eye(DIMENSION)
-    F[ATTITUDE, ATTITUDE] = step.T
-    F[ATTITUDE, GYRO_BIAS] = -right_jacobian(turn) * dt
-    F[VELOCITY, ATTITUDE] = by_force @ half.T
-    F[VELOCITY, GYRO_BIAS] = -by_force @ right_jacobian(turn / 2) * (dt / 2)
-    F[VELOCITY, ACCELEROMETER_BIAS] = -R_half * dt
-    F[VELOCITY, GRAVITY_DIRECTION] = GRAVITY * state.Q @ TILT * dt
-    F[POSITION] += F[VELOCITY] * (dt / 2)
-    F[POSITION, VELOCITY] = np.eye(3) * dt
-    return moved, F
+    dt = dt[:, None]
+    by_attitude = -R_half @ skew(forces) * dt
+    F = np.tile(np.eye(DIMENSION), (len(dt), 1, 1))
+    F[:, ATTITUDE, ATTITUDE] = wholes.swapaxes(1, 2)
+    F[:, ATTITUDE, GYRO_BIAS] = -right_jacobian(turns) * dt
+    F[:, VELOCITY, ATTITUDE] = by_attitude @ halves.swapaxes(1, 2)
+    F[:, VELOCITY, GYRO_BIAS] = -by_attitude @ right_jacobian(turns / 2) * (dt / 2)
+    F[:, VELOCITY, ACCELEROMETER_BIAS] = -R_half * dt
+    F[:, VELOCITY, GRAVITY_DIRECTION] = GRAVITY * state.Q @ TILT * dt
+    F[:, POSITION] += F[:, VELOCITY] * (dt / 2)
+    F[:, POSITION, VELOCITY] = np.eye(3) * dt
+    return replace(state, R=R[-1], p=p, v=v[-1]), F
 
 
 def motion_jacobian(state: State) -> FloatArray:
@@ -149,9 +161,9 @@ def motion_jacobian(state: State) -> FloatArray:
 
 
 def difference(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Log(predicted^-1 measured) (6,) of two motions (4, 4): the innovation, rotation first."""
-    both = RigidTransform.from_matrix(np.stack([predicted, measured]))
-    return np.asarray((both[0].inv() * both[1]).as_exp_coords())
+    """The innovation (6,) of two motions (4, 4), Log(predicted^-1 measured) to first order, rotation first."""
+    R = predicted[:3, :3].T
+    return np.concatenate([log(R @ measured[:3, :3]), R @ (measured[:3, 3] - predicted[:3, 3])])
 
 
 def inject(state: State, error: FloatArray) -> State:
@@ -194,19 +206,19 @@ class Filter:
         sigma[ACCELEROMETER_BIAS] = config.accelerometer_bias_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
         self.kf.P = np.diag(sigma**2)
+        density = np.zeros(DIMENSION)
+        density[ATTITUDE] = config.gyro_noise
+        density[GYRO_BIAS] = config.gyro_bias_walk
+        density[ACCELEROMETER_BIAS] = config.accelerometer_bias_walk
+        self.imu_walk = np.diag(density**2)
 
     def predict_by_imu(self, window: ImuWindow) -> None:
         """Move on by what an IMU measured."""
         if not self.knows_gravity:
             self._look_down(window)
-        config = self.config
-        for dt, rate, acceleration in zip(*window, strict=True):
-            self.state, self.kf.F = propagate(self.state, rate, acceleration, dt)
-            variance = np.zeros(DIMENSION)
-            variance[ATTITUDE] = config.gyro_noise**2 * dt
-            variance[GYRO_BIAS] = config.gyro_bias_walk**2 * dt
-            variance[ACCELEROMETER_BIAS] = config.accelerometer_bias_walk**2 * dt
-            self.kf.Q = np.diag(variance) + _velocity_walk(config.accelerometer_noise, dt)
+        self.state, jacobians = propagate(self.state, window)
+        for dt, self.kf.F in zip(window.durations, jacobians, strict=True):
+            self.kf.Q = self.imu_walk * dt + _velocity_walk(self.config.accelerometer_noise, dt)
             self.kf.predict()
 
     def predict_by_constancy(self, dt: float) -> None:
@@ -228,19 +240,19 @@ class Filter:
         self.kf.P[:, VELOCITY] = 0.0
         self.kf.P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
 
-    def squared_innovation(self, step: PairEstimate) -> float:
-        """The squared Mahalanobis distance between prediction and measurement: chi-square of 6 degrees of freedom."""
+    def squared_innovation(self, motion: FloatArray, covariance: FloatArray) -> float:
+        """Squared Mahalanobis distance of a measured motion (4, 4) to the predicted: chi-square, 6 degrees of freedom."""
         H = motion_jacobian(self.state)
-        innovation = difference(step.T_source_target.as_matrix(), self.state.motion)
-        return float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + step.covariance, innovation))
+        innovation = difference(motion, self.state.motion)
+        return float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + covariance, innovation))
 
-    def update(self, step: PairEstimate) -> None:
-        """Correct by a pair estimate from the clone to now (Joseph form), move the error into the state and reset it."""
+    def update(self, motion: FloatArray, covariance: FloatArray) -> None:
+        """Correct by the motion (4, 4) since the clone (Joseph form), move the error into the state and reset it."""
         self.kf.update(
-            step.T_source_target.as_matrix(),
+            motion,
             HJacobian=lambda _: motion_jacobian(self.state),
             Hx=lambda _: self.state.motion,
-            R=step.covariance,
+            R=covariance,
             residual=difference,
         )
         error = self.kf.x
@@ -290,7 +302,7 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Ekf
     states, covariances = [filter_.state], [filter_.pose_covariance()]
     nis = np.empty(len(steps))
     measured = rejected = in_a_row = 0
-    for k, step in enumerate(steps):
+    for k, (step, motion) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
         window = windows.over(step.source_stamp_ns, step.target_stamp_ns) if windows else None
         before = filter_.state, filter_.kf.P
         if window:
@@ -298,10 +310,10 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Ekf
             filter_.predict_by_imu(window)
         else:
             filter_.predict_by_constancy(step.duration_s)
-        nis[k] = filter_.squared_innovation(step)
+        nis[k] = filter_.squared_innovation(motion, step.covariance)
         if nis[k] <= threshold:
             in_a_row = 0
-            filter_.update(step)
+            filter_.update(motion, step.covariance)
         elif in_a_row < config.max_rejected_in_a_row:
             in_a_row += 1
             rejected += 1
@@ -309,7 +321,7 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Ekf
             filter_.state, filter_.kf.P = before
             filter_.forget_velocity()
             filter_.predict_by_constancy(step.duration_s)
-            filter_.update(step)
+            filter_.update(motion, step.covariance)
         filter_.clone(step.duration_s)
         states.append(filter_.state)
         covariances.append(filter_.pose_covariance())

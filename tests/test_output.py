@@ -101,13 +101,19 @@ def _write(folder: Path, outcome: output.Outcome) -> Path:
     return folder
 
 
+def _log(folder: Path, outcome: output.Outcome) -> Path:
+    output.write_log(output.prepare_folder(folder, outcome.log.path), outcome)
+    return folder / "run.mcap"
+
+
 def test_a_run_leaves_these_files_and_no_others(tmp_path: Path, outcome: output.Outcome) -> None:
     folder = _write(tmp_path / "out", outcome)
     assert {path.name for path in folder.iterdir()} == FILES
 
 
 def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.Outcome) -> None:
-    document = json.loads((_write(tmp_path / "out", outcome) / "metrics.json").read_text())
+    output.write_metrics(tmp_path, outcome, SECONDS)
+    document = json.loads((tmp_path / "metrics.json").read_text())
     assert document.keys() == {"schema", "log", "trajectories", "calibration", "timing"}
     assert document["schema"] == 1
     assert document["log"] == {
@@ -174,7 +180,8 @@ def test_a_back_end_that_was_not_asked_for_is_absent_also_from_an_earlier_run(
 
 
 def test_the_text_files_read_back_bit_for_bit(tmp_path: Path, outcome: output.Outcome) -> None:
-    folder = _write(tmp_path / "out", outcome)
+    folder = output.prepare_folder(tmp_path / "out", outcome.log.path)
+    output.write_text(folder, outcome)
     for name, trajectory in outcome.trajectories.items():
         tum = read_tum(folder / f"{name}.tum")
         np.testing.assert_array_equal(tum.stamps_ns, trajectory.stamps_ns)
@@ -186,7 +193,7 @@ def test_the_text_files_read_back_bit_for_bit(tmp_path: Path, outcome: output.Ou
 
 
 def test_the_log_holds_what_was_consumed_and_no_images_unless_asked(tmp_path: Path, outcome: output.Outcome) -> None:
-    log = open_log(_write(tmp_path / "out", outcome) / "run.mcap")
+    log = open_log(_log(tmp_path / "out", outcome))
     np.testing.assert_array_equal(log.frame_stamps(), STAMPS_NS)
     assert not log.has_frames
     imu = log.imu()
@@ -210,7 +217,7 @@ def test_the_log_holds_what_was_consumed_and_no_images_unless_asked(tmp_path: Pa
 
 def test_the_log_with_everything_has_the_frames_as_they_were(tmp_path: Path, outcome: output.Outcome) -> None:
     everything = replace(outcome, config=config.load(None, {"record": "all"}))
-    log = open_log(_write(tmp_path / "out", everything) / "run.mcap")
+    log = open_log(_log(tmp_path / "out", everything))
     for again, frame in zip(log.frames(), outcome.log.frames(), strict=True):
         assert again.stamp_ns == frame.stamp_ns
         np.testing.assert_array_equal(again.image, frame.image)
@@ -218,14 +225,14 @@ def test_the_log_with_everything_has_the_frames_as_they_were(tmp_path: Path, out
 
 
 def test_the_log_says_from_what_and_how_it_was_made(tmp_path: Path, outcome: output.Outcome) -> None:
-    metadata = open_log(_write(tmp_path / "out", outcome) / "run.mcap").metadata
+    metadata = open_log(_log(tmp_path / "out", outcome)).metadata
     assert metadata["source"] == {"log": "source.mcap", "sha256": outcome.log.sha256}
     assert metadata["config"] == {"toml": config.to_toml(outcome.config)}
     assert {"violearner-fusion", "gtsam", "numpy"} <= metadata["versions"].keys()
 
 
 def test_the_log_is_a_function_of_the_outcome(tmp_path: Path, outcome: output.Outcome) -> None:
-    logs = [(_write(tmp_path / name, outcome) / "run.mcap").read_bytes() for name in ("a", "b")]
+    logs = [_log(tmp_path / name, outcome).read_bytes() for name in ("a", "b")]
     assert logs[0] == logs[1]
 
 
@@ -236,7 +243,8 @@ def test_a_failure_while_writing_keeps_the_earlier_file_and_leaves_no_half_one(
     monkeypatch: pytest.MonkeyPatch,
     write: Callable[[Path, output.Outcome], None],
 ) -> None:
-    folder = _write(tmp_path / "out", outcome)
+    folder = output.prepare_folder(tmp_path / "out", outcome.log.path)
+    write(folder, outcome)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
 
     def no_space(_: int) -> None:
@@ -249,7 +257,7 @@ def test_a_failure_while_writing_keeps_the_earlier_file_and_leaves_no_half_one(
 
 
 def test_the_log_that_is_read_is_never_replaced(tmp_path: Path, outcome: output.Outcome) -> None:
-    folder = _write(tmp_path / "out", outcome)
+    folder = _log(tmp_path / "out", outcome).parent
     with pytest.raises(UsageError, match="is the log to be read"):
         output.prepare_folder(folder, folder / "run.mcap")
 

@@ -233,7 +233,11 @@ class _Scan:
             raise _BrokenRecordError("the file ends")
         checked_end = self._file.tell() - len(MCAP0_MAGIC) - 4
         summary_start, _, crc = _FOOTER.unpack_from(body)
-        if not body.endswith(MCAP0_MAGIC) or (crc and summary_start and self._crc(summary_start, checked_end) != crc):
+        if (
+            not body.endswith(MCAP0_MAGIC)
+            or summary_start > checked_end
+            or (crc and summary_start and self._crc(summary_start, checked_end) != crc)
+        ):
             self._statistics = None
             self._note("bad_summary", "the summary at the end of the file is damaged")
         self._at_end = True
@@ -314,15 +318,15 @@ class _Scan:
                 if chunk and chunk.consistent:
                     return match.start()
         summary_start = self._summary_start()
-        return summary_start if summary_start and summary_start >= position else None
+        return summary_start if position <= summary_start < self._size else None
 
-    def _summary_start(self) -> int | None:
-        """The place of the summary (or of the footer, if there is no summary) as the end of the file tells it."""
+    def _summary_start(self) -> int:
+        """The place of the summary, or of the footer if there is no summary, as the end of the file tells it; or 0."""
         footer_start = self._size - len(MCAP0_MAGIC) - _FOOTER.size - RECORD.size
         self._file.seek(max(footer_start, 0))
         tail = self._file.read()
         if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MCAP0_MAGIC):
-            return None
+            return 0
         return int(_FOOTER.unpack_from(tail, RECORD.size)[0]) or footer_start
 
     # --- Messages -------------------------------------------------------------------------------

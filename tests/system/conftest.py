@@ -75,7 +75,7 @@ def simulated_drive() -> Callable[..., Drive]:
             )
             for stamp in stamps_ns
         ]
-        return Drive(frames, simulate_imu(motion, imu_stamps_ns, ImuModel(), seed), truth, _pairs(truth, rng))
+        return Drive(frames, simulate_imu(motion, imu_stamps_ns, 100.0, ImuModel(), seed), truth, _pairs(truth, rng))
 
     return make
 

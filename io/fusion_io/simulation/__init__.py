@@ -4,10 +4,9 @@ textures: what surfaces look like; street, ground: what stands where; world: the
 how the camera moves and what an IMU measures; clips, logs: what comes out.
 """
 
-# Modules that bring numpy, scipy or OpenCV are imported by the function that needs them, so that --help answers at once.
-
 from __future__ import annotations
 
+# Modules that bring numpy, scipy or OpenCV are imported by the function that needs them: --help answers at once.
 import argparse
 import math
 from pathlib import Path

@@ -66,7 +66,10 @@ class GroundMap:
         self._sunlight = _sunlight(tiles, shadows)
 
     def lookup(self, x: Float32, y: Float32) -> tuple[Float32, Float32, Float32]:
-        """At x, y (N,) metres: lateral (left positive) and along the road, metres, and sunlight 0..1, each (N,)."""
+        """At x, y (N,) metres: lateral (left positive) and along the road, metres, and sunlight 0..1, each (N,).
+
+        Along is NaN where two roads meet.
+        """
         x, y = x / np.float32(TILE_CELLS), y / np.float32(TILE_CELLS)
         floor_x, floor_y = np.floor(x), np.floor(y)
         x, y = x - floor_x, y - floor_y
@@ -81,7 +84,10 @@ class GroundMap:
 
 
 def _road_coordinates(path: Path, tiles: NDArray[np.int64]) -> tuple[Float32, Float32]:
-    """Lateral and along on every tile's grid, each (tiles + 1, 17, 17), from the nearest station of a road."""
+    """Lateral and along on every tile's grid, each (tiles + 1, 17, 17), from the nearest station of a road.
+
+    Along is NaN at seams between roads, where the coordinates must not be interpolated.
+    """
     steps = np.arange(TILE_CELLS + 1.0)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
     points = (tiles[:, None, None] * TILE_CELLS + grid).reshape(-1, 2)
@@ -92,11 +98,16 @@ def _road_coordinates(path: Path, tiles: NDArray[np.int64]) -> tuple[Float32, Fl
     lateral = np.einsum("ij,ij->i", offset, path.normals[station])
     along = path.distances[station] + np.einsum("ij,ij->i", offset, path.tangents[station])
     lateral[distance > MAP_REACH_METRES] = FAR_METRES
-    size = len(steps)
-    elsewhere = np.full((1, size, size), FAR_METRES)
-    both = (np.concatenate([values.reshape(-1, size, size), elsewhere]) for values in (lateral, along))
-    lateral32, along32 = (values.astype(np.float32) for values in both)
-    return lateral32, along32
+    shape = (len(tiles), len(steps), len(steps))
+    lateral, along = lateral.reshape(shape), along.reshape(shape)
+    for axis in (1, 2):  # a jump between neighbours is where another road is nearer
+        seam = np.abs(np.diff(lateral, axis=axis)) > 1.5
+        before, after = (np.swapaxes(along, 1, axis)[:, s] for s in (slice(None, -1), slice(1, None)))
+        before[np.swapaxes(seam, 1, axis)] = after[np.swapaxes(seam, 1, axis)] = np.nan
+    elsewhere = np.full((1, *shape[1:]), FAR_METRES)
+    return np.concatenate([lateral, elsewhere]).astype(np.float32), np.concatenate([along, elsewhere]).astype(
+        np.float32
+    )
 
 
 def _sunlight(tiles: NDArray[np.int64], shadows: Sequence[FloatArray]) -> Float32:

@@ -1,8 +1,8 @@
-"""The street along a path: houses, cars, hedges, trees, poles and the ground, all as convex polygons.
+"""The street along a path: houses, cars, hedges, trees and poles, all as convex polygons.
 
-What stands where is drawn by a generator whose seed is the world's seed and the place, so content
-is a function of place; the path only says where the road is. The corridor around the whole path is
-kept clear: nothing stands where the camera passes, however often the path crosses itself.
+The path says where the road is; what stands beside it is drawn by generators whose seeds are the
+world's seed and the place. A path that returns to a place finds the road that its first visit made
+there, and the corridor around the whole path is kept clear, however often it crosses itself.
 """
 
 from __future__ import annotations
@@ -360,7 +360,7 @@ class Builder:
         gables = site.points(np.array([[b, c, far], [d, a, near]]))
         self._collector.add(gables, surface, tint, np.array([shift, size[2] / scale]), scale)
         roof = site.points(np.array([[a, b, far, near], [c, d, near, far]]))
-        self._collector.add(roof, Surface.ROOF, _tint(rng, 0.3, 0.9, 0.1), shift)
+        self._collector.add(roof, Surface.ROOF, _tint(rng, 0.3, 0.9, 0.05), shift)
 
     def car(self, rng: np.random.Generator, centre: FloatArray, heading: float) -> None:
         """A car or van: body, cabin, shadowed underside, wheels, lights and number plates."""
@@ -403,7 +403,7 @@ class Builder:
             return
         site.settle()
         sunk = 0.7
-        look = (_tint(rng, 0.4, 1.2, 0.1), rng.uniform(0, TILE_METRES), rng.uniform(0.7, 1.3))
+        look = (_tint(rng, 0.4, 1.2, 0.05), rng.uniform(0, TILE_METRES), rng.uniform(0.7, 1.3))
         self._boxes(site, BOX, (length, thickness, height + sunk), (0, 0, -sunk), surface, *look)
         self._shadow(site.outline(_RIM * [length, thickness]), height)
 
@@ -415,7 +415,7 @@ class Builder:
     def tree(self, rng: np.random.Generator, centre: FloatArray) -> None:
         """A trunk with one to three crowns."""
         girth, stem = rng.uniform(0.15, 0.4), rng.uniform(2.2, 4.0)
-        self._post(rng, centre, girth, stem + 1.0, Surface.WOOD, _tint(rng, 0.4, 1.0, 0.1))
+        self._post(rng, centre, girth, stem + 1.0, Surface.WOOD, _tint(rng, 0.4, 1.0, 0.05))
         for _ in range(int(rng.integers(1, 4))):
             radii = rng.uniform(1.0, 2.4, 3) * [1.0, 1.0, 1.2]
             place = centre + rng.normal(0.0, 0.5, 2)
@@ -429,7 +429,7 @@ class Builder:
         site.settle()
         faces = site.points(DODECAHEDRON * radii + [0.0, 0.0, height])
         shifts = rng.uniform(0, TILE_METRES, (len(faces), 2))
-        self._collector.add(faces, Surface.FOLIAGE, _tint(rng, 0.4, 1.3, 0.1), shifts)
+        self._collector.add(faces, Surface.FOLIAGE, _tint(rng, 0.4, 1.3, 0.05), shifts)
         angles = np.arange(8) * np.pi / 4
         disc = 0.85 * np.column_stack([radii[0] * np.cos(angles), radii[1] * np.sin(angles)])
         self._shadow(site.outline(disc), height + 0.5 * radii[2], max(height - 0.5 * radii[2], 0.0))

@@ -43,6 +43,28 @@ class Surface(IntEnum):
     FACADE = 12
 
 
+# RGB of each surface beside its grey tile, with a mean of one.
+COLOURS = np.array(
+    [
+        (1.00, 1.00, 1.03),
+        (1.04, 1.00, 0.95),
+        (0.90, 1.15, 0.60),
+        (0.80, 1.15, 0.60),
+        (1.30, 0.90, 0.75),
+        (1.05, 1.00, 0.92),
+        (1.00, 1.00, 1.00),
+        (0.95, 1.00, 1.08),
+        (1.15, 1.00, 0.80),
+        (1.00, 1.00, 1.00),
+        (1.10, 1.00, 0.85),
+        (1.00, 1.00, 1.00),
+        *[(1.05, 1.00, 0.92)] * FACADES,
+    ],
+    np.float32,
+)
+COLOURS /= COLOURS.mean(axis=1, keepdims=True)
+
+
 def noise(rng: np.random.Generator, cells: Sequence[int], amplitudes: Sequence[float]) -> Float32:
     """Periodic value noise: one random lattice of ``cells`` x ``cells`` an octave, cubic in between.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fusion_io.records import FloatArray
 from fusion_io.simulation.ground import CELL_METRES, GroundMap, build_ground
 from fusion_io.simulation.street import Look, Path, Polygons, build_street
-from fusion_io.simulation.textures import Float32, Surface, library
+from fusion_io.simulation.textures import COLOURS, Float32, Surface, library
 
 VIEW_METRES = 120.0  # nothing further away is drawn
 INDEX_METRES = 32.0
@@ -90,6 +90,8 @@ class World:
             light[on_ground] *= tone[:, None]
         octave = across + np.float32(SLANT_SHARE) * slant - view.log_scales[polygon]
         light *= library().lookup(surface, u, v, octave)[:, None]
+        if colour:
+            light *= COLOURS[surface]
         radiance = np.empty((height * width, channels), np.float32)
         radiance[pixels] = light
         sky = np.flatnonzero(flat < 0)
@@ -109,14 +111,14 @@ class World:
         x, y = (x + self._offset[0]) * np.float32(0.25), (y + self._offset[1]) * np.float32(0.25)
         tone *= 0.5 + library().lookup(PATCHES, x, y, across + slant - 2)
         width, length = np.exp2(across), np.exp2(across + slant)
-        kerb = _stripe(lateral - look.road_left_m, 0.07, width) + _stripe(lateral + look.road_right_m, 0.07, width)
-        paint = 0.8 * kerb
+        paint = _stripe(lateral - look.road_left_m, 0.07, width) + _stripe(lateral + look.road_right_m, 0.07, width)
+        paint *= 0.8  # kerbstones
         if look.markings:
             dash = np.clip((1.5 - np.abs(np.mod(along, 9.0) - 4.5)) / length + 0.5, 0.0, 1.0)
             centre = 0.5 * (look.road_left_m - look.road_right_m)
             paint += 1.2 * dash * _stripe(lateral - centre, 0.07, width)
             paint += 1.2 * _stripe(lateral + look.road_right_m - 0.35, 0.06, width)
-        tone *= 1.0 + paint
+        tone *= 1.0 + np.where(np.isnan(along), 0.0, paint).astype(np.float32)
         tone *= look.ambient + (1.0 - look.ambient) * look.sun[2] * sunlight
         return tone, surface
 
