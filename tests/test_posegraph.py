@@ -38,9 +38,7 @@ def _pairs(truth: Trajectory, errors: FloatArray, sigma: FloatArray) -> list[Pai
     motions = truth.poses[:-1].inv() * truth.poses[1:] * RigidTransform.from_exp_coords(errors)
     quats, translations = motions.rotation.as_quat(scalar_first=True), motions.translation
     return [
-        PairEstimate(
-            int(truth.stamps_ns[k]), int(truth.stamps_ns[k + 1]), quats[k], translations[k], np.diag(sigma**2)
-        )
+        PairEstimate(int(truth.stamps_ns[k]), int(truth.stamps_ns[k + 1]), quats[k], translations[k], np.diag(sigma**2))
         for k in range(len(errors))
     ]
 
@@ -210,9 +208,7 @@ def test_a_graph_that_has_no_solution_falls_back_to_the_pairs(monkeypatch: pytes
         ({"covariance": np.eye(6) + np.triu(np.full((6, 6), 0.1), 1)}, "symmetric"),
     ],
 )
-def test_what_is_no_measurement_is_refused_before_it_reaches_gtsam(
-    change: dict[str, FloatArray], reason: str
-) -> None:
+def test_what_is_no_measurement_is_refused_before_it_reaches_gtsam(change: dict[str, FloatArray], reason: str) -> None:
     pairs = _log(9, 10).pairs
     pairs[4] = replace(pairs[4], **change)
     with pytest.raises(LogError, match=f"pair estimate at {pairs[4].target_stamp_ns} ns.*{reason}"):

@@ -217,10 +217,19 @@ def test_dead_reckoning_of_a_perfect_imu_follows_the_motion(motion):
 
 def test_an_imu_at_rest_shows_gravity_upwards():
     """A standing car: no rate, and +g along the IMU's z axis."""
-    parked = DriveStyle(speed_mps=0, speed_change_mps=0, shake=0)
+    parked = DriveStyle(speed_mps=0, speed_change_mps=0, shake=0, slope=0)
     imu = simulate_imu(drive(0, 0.0, 2.0, parked), imu_stamps(0.5, 1.5, 100.0), 100.0, PERFECT_IMU, 0)
     np.testing.assert_allclose(imu.angular_velocity, 0.0, atol=1e-9)
     np.testing.assert_allclose(imu.linear_acceleration, np.tile([0, 0, 9.81], (len(imu), 1)), atol=1e-9)
+
+
+def test_a_car_that_stands_on_a_slope_does_not_move():
+    """Hills belong to the road, not to time: without speed and shake nothing changes."""
+    motion = drive(0, 0.0, 2.0, DriveStyle(speed_mps=0, speed_change_mps=0, shake=0, slope=0.1))
+    first, *rest = motion.poses(np.arange(0.5, 1.5, 0.1)).as_matrix()
+    assert abs(first[2, 2]) > 1e-3
+    for pose in rest:
+        np.testing.assert_allclose(pose, first, atol=1e-9)
 
 
 def test_bias_and_noise_are_as_configured(motion):

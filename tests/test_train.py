@@ -15,9 +15,7 @@ from learned.dataset import Pairs
 from learned.train import RECIPES, Recipe, draw_batch, learning_rate_factor, optimise
 from learned.violearner import NetworkConfig, VIOLearner
 
-TINY = NetworkConfig(
-    height=32, width=64, trunk_filters=4, extra_filters=4, imu_filters=(2, 2, 4, 4, 4, 4, 4)
-)
+TINY = NetworkConfig(height=32, width=64, trunk_filters=4, extra_filters=4, imu_filters=(2, 2, 4, 4, 4, 4, 4))
 RECIPE = Recipe(steps=6, batch=2, validate_every=2)
 
 

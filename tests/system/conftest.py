@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, FloatArray, ImuSeries, PairEstimate, Trajectory
 from fusion_io.simulation.motion import DriveStyle, ImuModel, drive, simulate_imu
@@ -26,10 +26,13 @@ class Drive:
     imu: ImuSeries
     ground_truth: Trajectory
     pairs: list[PairEstimate]
+    mounting: Rotation | None = None
 
     def write(self, path: Path, leave_out: Iterable[str] = ()) -> Path:
         """Write it as a log without what is left out: frames, camera_info, imu, ground_truth, pairs."""
         with LogWriter(path) as log:
+            if self.mounting is not None:
+                log.mounting(self.mounting)
             for role in {"imu", "ground_truth", "pairs"}.difference(leave_out):
                 getattr(log, role)(getattr(self, role))
             for frame in self.frames if "frames" not in leave_out else ():

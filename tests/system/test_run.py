@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fusion import posegraph, run
 from fusion_io import convert
@@ -96,6 +97,18 @@ def test_a_replay_of_the_output_gives_the_same_bytes(tmp_path: Path, log: Path) 
     assert _trajectory_bytes(tmp_path / "again") == _trajectory_bytes(tmp_path / "first")
     assert again["calibration"] == first["calibration"]
     assert again["log"]["imu_samples"] == first["log"]["imu_samples"]
+
+
+def test_a_replay_of_a_log_that_gives_the_mounting_gives_the_same_bytes(
+    tmp_path: Path, simulated_drive: Callable[..., Any]
+) -> None:
+    drive = simulated_drive(6.0)
+    drive.mounting = Rotation.from_euler("xyz", [-89.7, 0.4, -90.2], degrees=True)
+    _, first = _run(drive.write(tmp_path / "drive.mcap"), tmp_path / "first")
+    assert "mounting given" in first["calibration"]["reason"]
+    _, again = _run(tmp_path / "first" / "run.mcap", tmp_path / "again")
+    assert again["calibration"] == first["calibration"]
+    assert _trajectory_bytes(tmp_path / "again") == _trajectory_bytes(tmp_path / "first")
 
 
 @pytest.mark.parametrize("record", ["light", "all"])

@@ -114,6 +114,7 @@ def simulate_imu(motion: Motion, stamps_ns: IntArray, rate_hz: float, model: Imu
 MAX_YAW_RATE = 0.5  # rad/s
 MAX_LATERAL_ACCELERATION = 4.0  # m/s^2
 CAMERA_AHEAD_METRES = 1.7  # of the rear axle, which is what follows the road
+HILL_METRES = 120.0  # how long a rise or a fall of the road is
 KNOT_SECONDS = 0.05
 
 
@@ -148,12 +149,17 @@ def drive(seed: int, start_s: float, end_s: float, style: DriveStyle) -> Motion:
     count = max(int(np.ceil((end_s - start_s) / KNOT_SECONDS)) + 1, 6)
     times = np.asarray(start_s + KNOT_SECONDS * np.arange(count), np.float64)
 
-    speed = np.maximum(style.speed_mps + style.speed_change_mps * _wander(rng, count, 8.0), 0.0)
+    def wander(period_s: float) -> FloatArray:
+        return _wander(rng, count, period_s / KNOT_SECONDS)
+
+    speed = np.maximum(style.speed_mps + style.speed_change_mps * wander(8.0), 0.0)
     speed = gaussian_filter1d(speed, 0.3 / KNOT_SECONDS, mode="nearest")  # stopping and starting takes time
     limit = np.minimum(MAX_YAW_RATE, MAX_LATERAL_ACCELERATION / np.maximum(speed, 1e-3))
     grip = np.minimum(speed / 2.0, 1.0)  # a standing car does not turn
-    yaw_rate = grip * limit * np.tanh(style.yaw_rate * _wander(rng, count, 6.0) / limit)
-    gradient = style.slope * _wander(rng, count, 12.0)
+    yaw_rate = grip * limit * np.tanh(style.yaw_rate * wander(6.0) / limit)
+    distance = _integral(speed)
+    hills = _wander(rng, int(distance[-1]) + 2, HILL_METRES)  # metre by metre
+    gradient = style.slope * np.interp(distance, np.arange(len(hills)), hills)
 
     yaw = _integral(yaw_rate)
     axle = np.column_stack(
@@ -162,7 +168,7 @@ def drive(seed: int, start_s: float, end_s: float, style: DriveStyle) -> Motion:
 
     liveliness = style.shake * np.minimum(0.15 + speed / 8.0, 1.5)
     pitch, roll, heave = (
-        liveliness * (slow * _wander(rng, count, 1.6) + fast * _wander(rng, count, 0.6))
+        liveliness * (slow * wander(1.6) + fast * wander(0.6))
         for slow, fast in ((0.006, 0.002), (0.007, 0.002), (0.012, 0.003))
     )
     dive = 0.003 * np.gradient(speed, KNOT_SECONDS)
@@ -176,9 +182,9 @@ def drive(seed: int, start_s: float, end_s: float, style: DriveStyle) -> Motion:
     return Motion(times, RigidTransform.from_components(positions, body * mounting * ROTATION_WORLD_CAMERA_LEVEL))
 
 
-def _wander(rng: np.random.Generator, count: int, period_s: float) -> FloatArray:
-    """A smooth random signal (count,) at the knots, of unit variance, whose features last about period_s."""
-    sigma = 0.25 * period_s / KNOT_SECONDS
+def _wander(rng: np.random.Generator, count: int, period: float) -> FloatArray:
+    """A smooth random signal (count,) of unit variance, whose features last about ``period`` steps."""
+    sigma = 0.25 * period
     margin = int(4 * sigma) + 1
     white = rng.standard_normal(count + 2 * margin)
     smooth = gaussian_filter1d(white, sigma)[margin : margin + count]
