@@ -113,6 +113,9 @@ class EkfConfig(Section):
     gyro_bias_sigma: PositiveFloat = 1e-2
     accelerometer_bias_sigma: PositiveFloat = 0.2
     gravity_sigma: PositiveFloat = 0.3
+    pair_rate_bias_sigma: PositiveFloat = 5e-4
+    pair_scale_sigma: PositiveFloat = 0.02
+    pair_correlation_s: PositiveFloat = 30.0
     velocity_sigma: PositiveFloat = 30.0
     angular_acceleration: PositiveFloat = 1.0
     acceleration: PositiveFloat = 3.0

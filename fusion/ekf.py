@@ -4,7 +4,7 @@ The nominal state lives outside the filter, which estimates its error (filterpy)
 spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
 moved into the nominal state; then the present pose becomes the clone. Everything is causal.
 
-Error state (23): attitude, position, velocity, gyro bias, accelerometer bias, gravity direction (2), attitude and
+Error state (27): attitude, position, velocity, gyro bias, accelerometer bias, gravity direction (2), attitude and
 position of the clone. Attitudes err on the right, R = R_nominal Exp(error), all else adds. Gravity is the third column of
 a rotation, Q e3 times its magnitude, of which only two errors are felt. The world is the first camera's frame.
 
@@ -32,8 +32,9 @@ GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the acceler
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
-CLONE_ATTITUDE, CLONE_POSITION = slice(17, 20), slice(20, 23)
-DIMENSION = 23
+PAIR_RATE_BIAS, PAIR_SCALE = slice(17, 20), slice(20, 21)
+CLONE_ATTITUDE, CLONE_POSITION = slice(21, 24), slice(24, 27)
+DIMENSION = 27
 
 # The cross products with the three unit vectors.
 GENERATORS = np.array(
@@ -75,6 +76,8 @@ class State:
     gyro_bias: FloatArray
     accelerometer_bias: FloatArray
     Q: FloatArray
+    pair_rate_bias: FloatArray
+    pair_scale: float
     R_clone: FloatArray
     p_clone: FloatArray
 
@@ -85,11 +88,18 @@ class State:
 
     @property
     def motion(self) -> FloatArray:
-        """T_clone_now (4, 4), what a pair estimate measures."""
+        """T_clone_now (4, 4)."""
         motion = np.eye(4)
         motion[:3, :3] = self.R_clone.T @ self.R
         motion[:3, 3] = self.R_clone.T @ (self.p - self.p_clone)
         return motion
+
+    def measurement(self, dt: float) -> FloatArray:
+        """What a pair estimate over dt seconds shows of the motion (4, 4): turned by its bias, scaled by its error."""
+        shown = self.motion
+        shown[:3, :3] = shown[:3, :3] @ exp(self.pair_rate_bias * dt)
+        shown[:3, 3] *= 1.0 + self.pair_scale
+        return shown
 
 
 def exp(vectors: FloatArray) -> FloatArray:
@@ -119,7 +129,7 @@ def right_jacobian(vectors: FloatArray) -> FloatArray:
 
 
 def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
-    """The state after M pieces of IMU, and the Jacobians (M, 23, 23) of its error from piece to piece.
+    """The state after M pieces of IMU, and the Jacobians (M, 27, 27) of its error from piece to piece.
 
     Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it.
     """
@@ -147,16 +157,19 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
     return replace(state, R=R[-1], p=p, v=v[-1]), F
 
 
-def motion_jacobian(state: State) -> FloatArray:
-    """H (6, 23): how T_clone_now, perturbed on the right, changes with the error."""
-    motion = state.motion
-    R_motion, t_motion = motion[:3, :3], motion[:3, 3]
+def measurement_jacobian(state: State, dt: float) -> FloatArray:
+    """H (6, 27): how what a pair estimate shows, perturbed on the right, changes with the error."""
+    motion, shown = state.motion, state.measurement(dt)
+    t, R_shown, turn = motion[:3, 3], shown[:3, :3], state.pair_rate_bias * dt
     H = np.zeros((6, DIMENSION))
-    H[:3, ATTITUDE] = np.eye(3)
-    H[:3, CLONE_ATTITUDE] = -R_motion.T
-    H[3:, POSITION] = state.R.T
-    H[3:, CLONE_POSITION] = -state.R.T
-    H[3:, CLONE_ATTITUDE] = R_motion.T @ skew(t_motion)
+    H[:3, ATTITUDE] = exp(-turn)
+    H[:3, CLONE_ATTITUDE] = -R_shown.T
+    H[:3, PAIR_RATE_BIAS] = right_jacobian(turn) * dt
+    scale = 1.0 + state.pair_scale
+    H[3:, POSITION] = scale * exp(-turn) @ state.R.T
+    H[3:, CLONE_POSITION] = -H[3:, POSITION]
+    H[3:, CLONE_ATTITUDE] = scale * R_shown.T @ skew(t)
+    H[3:, PAIR_SCALE] = R_shown.T @ t[:, None]
     return H
 
 
@@ -167,7 +180,7 @@ def difference(measured: FloatArray, predicted: FloatArray) -> FloatArray:
 
 
 def inject(state: State, error: FloatArray) -> State:
-    """The state with an error (23,) moved into it."""
+    """The state with an error (27,) moved into it."""
     return State(
         R=state.R @ exp(error[ATTITUDE]),
         p=state.p + error[POSITION],
@@ -175,13 +188,15 @@ def inject(state: State, error: FloatArray) -> State:
         gyro_bias=state.gyro_bias + error[GYRO_BIAS],
         accelerometer_bias=state.accelerometer_bias + error[ACCELEROMETER_BIAS],
         Q=state.Q @ exp(np.append(error[GRAVITY_DIRECTION], 0.0)),
+        pair_rate_bias=state.pair_rate_bias + error[PAIR_RATE_BIAS],
+        pair_scale=state.pair_scale + float(error[PAIR_SCALE][0]),
         R_clone=state.R_clone @ exp(error[CLONE_ATTITUDE]),
         p_clone=state.p_clone + error[CLONE_POSITION],
     )
 
 
 def reset_jacobian(error: FloatArray) -> FloatArray:
-    """(23, 23): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
+    """(27, 27): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
     G = np.eye(DIMENSION)
     G[ATTITUDE, ATTITUDE] = right_jacobian(error[ATTITUDE])
     G[CLONE_ATTITUDE, CLONE_ATTITUDE] = right_jacobian(error[CLONE_ATTITUDE])
@@ -195,7 +210,7 @@ class Filter:
     def __init__(self, config: EkfConfig) -> None:
         self.config = config
         eye, zero = np.eye(3), np.zeros(3)
-        self.state = State(eye, zero, zero, zero, zero, eye, eye, zero)
+        self.state = State(eye, zero, zero, zero, zero, eye, zero, 0.0, eye, zero)
         self.rate = np.zeros(3)  # rad/s in the last step; a step without IMU is predicted to go on so
         self.knows_gravity = False
         self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
@@ -205,6 +220,8 @@ class Filter:
         sigma[GYRO_BIAS] = config.gyro_bias_sigma
         sigma[ACCELEROMETER_BIAS] = config.accelerometer_bias_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
+        sigma[PAIR_RATE_BIAS] = config.pair_rate_bias_sigma
+        sigma[PAIR_SCALE] = config.pair_scale_sigma
         self.kf.P = np.diag(sigma**2)
         density = np.zeros(DIMENSION)
         density[ATTITUDE] = config.gyro_noise
@@ -234,24 +251,36 @@ class Filter:
         self.kf.Q = np.diag(variance) + _velocity_walk(config.acceleration, dt)
         self.kf.predict()
 
+    def drift(self, dt: float) -> None:
+        """Let what is wrong with the pairs fade and wander: Gauss-Markov processes."""
+        config, state = self.config, self.state
+        keep = np.exp(-dt / config.pair_correlation_s)
+        self.state = replace(state, pair_rate_bias=keep * state.pair_rate_bias, pair_scale=keep * state.pair_scale)
+        factor, variance = np.ones(DIMENSION), np.zeros(DIMENSION)
+        factor[PAIR_RATE_BIAS] = factor[PAIR_SCALE] = keep
+        variance[PAIR_RATE_BIAS] = (1 - keep**2) * config.pair_rate_bias_sigma**2
+        variance[PAIR_SCALE] = (1 - keep**2) * config.pair_scale_sigma**2
+        self.kf.F, self.kf.Q = np.diag(factor), np.diag(variance)
+        self.kf.predict()
+
     def forget_velocity(self) -> None:
         """Make the velocity as uncertain as at first, and independent of all else."""
         self.kf.P[VELOCITY, :] = 0.0
         self.kf.P[:, VELOCITY] = 0.0
         self.kf.P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
 
-    def squared_innovation(self, motion: FloatArray, covariance: FloatArray) -> float:
-        """Squared Mahalanobis distance of a measured motion (4, 4) to the predicted: chi-square, 6 degrees of freedom."""
-        H = motion_jacobian(self.state)
-        innovation = difference(motion, self.state.motion)
+    def squared_innovation(self, pair: FloatArray, covariance: FloatArray, dt: float) -> float:
+        """Squared Mahalanobis distance of a pair (4, 4) over dt s to the predicted: chi-square, 6 degrees of freedom."""
+        H = measurement_jacobian(self.state, dt)
+        innovation = difference(pair, self.state.measurement(dt))
         return float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + covariance, innovation))
 
-    def update(self, motion: FloatArray, covariance: FloatArray) -> None:
-        """Correct by the motion (4, 4) since the clone (Joseph form), move the error into the state and reset it."""
+    def update(self, pair: FloatArray, covariance: FloatArray, dt: float) -> None:
+        """Correct by a pair (4, 4) from the clone dt s ago (Joseph form), move the error into the state and reset it."""
         self.kf.update(
-            motion,
-            HJacobian=lambda _: motion_jacobian(self.state),
-            Hx=lambda _: self.state.motion,
+            pair,
+            HJacobian=lambda _: measurement_jacobian(self.state, dt),
+            Hx=lambda _: self.state.measurement(dt),
             R=covariance,
             residual=difference,
         )
@@ -286,7 +315,7 @@ class Filter:
 
 
 def _velocity_walk(density: float, dt: float) -> FloatArray:
-    """Covariance (23, 23) of a white acceleration of this density (m/s^2/sqrt(Hz)) over dt seconds."""
+    """Covariance (27, 27) of a white acceleration of this density (m/s^2/sqrt(Hz)) over dt seconds."""
     Q = np.zeros((DIMENSION, DIMENSION))
     Q[POSITION, POSITION] = density**2 * dt**3 / 3 * np.eye(3)
     Q[POSITION, VELOCITY] = Q[VELOCITY, POSITION] = density**2 * dt**2 / 2 * np.eye(3)
@@ -302,7 +331,7 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Ekf
     states, covariances = [filter_.state], [filter_.pose_covariance()]
     nis = np.empty(len(steps))
     measured = rejected = in_a_row = 0
-    for k, (step, motion) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
+    for k, (step, pair) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
         window = windows.over(step.source_stamp_ns, step.target_stamp_ns) if windows else None
         before = filter_.state, filter_.kf.P
         if window:
@@ -310,10 +339,11 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Ekf
             filter_.predict_by_imu(window)
         else:
             filter_.predict_by_constancy(step.duration_s)
-        nis[k] = filter_.squared_innovation(motion, step.covariance)
+        filter_.drift(step.duration_s)
+        nis[k] = filter_.squared_innovation(pair, step.covariance, step.duration_s)
         if nis[k] <= threshold:
             in_a_row = 0
-            filter_.update(motion, step.covariance)
+            filter_.update(pair, step.covariance, step.duration_s)
         elif in_a_row < config.max_rejected_in_a_row:
             in_a_row += 1
             rejected += 1
@@ -321,7 +351,8 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Ekf
             filter_.state, filter_.kf.P = before
             filter_.forget_velocity()
             filter_.predict_by_constancy(step.duration_s)
-            filter_.update(motion, step.covariance)
+            filter_.drift(step.duration_s)
+            filter_.update(pair, step.covariance, step.duration_s)
         filter_.clone(step.duration_s)
         states.append(filter_.state)
         covariances.append(filter_.pose_covariance())

@@ -56,8 +56,15 @@ def _log(seed: int, frames: int, noise: FloatArray = SIGMA, **imu_model: object)
     return Log(truth, _pairs(truth, errors, np.maximum(noise, 1e-4)), inertial)
 
 
-def _rotation_error_rad(log: Log, estimate: Trajectory) -> FloatArray:
-    return np.linalg.norm(pose_errors(estimate.poses, log.truth.poses)[1], axis=1)
+def _distance_m(one: Trajectory, other: Trajectory) -> float:
+    """Between the last positions."""
+    return float(np.linalg.norm(one.poses.translation[-1] - other.poses.translation[-1]))
+
+
+def _turned_rad(one: Trajectory, other: Trajectory, start: int = 0, end: int = -1) -> float:
+    """The difference of the rotations from pose `start` to pose `end`."""
+    rotations = [each.poses.rotation[start].inv() * each.poses.rotation[end] for each in (one, other)]
+    return float((rotations[0].inv() * rotations[1]).magnitude())
 
 
 def _without(series: ImuSeries, start_s: float, end_s: float) -> ImuSeries:
@@ -89,26 +96,26 @@ def test_exact_measurements_give_the_exact_trajectory_with_the_first_pose_as_the
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.03])
-def test_a_gyro_makes_the_orientation_better_whether_it_has_a_bias_or_none(bias: float) -> None:
-    log = _log(2, 300, 2 * SIGMA, gyro_bias=np.array([bias, -bias, bias]))
-    fused, raw = posegraph.solve(log.pairs, log.inertial, CONFIG).trajectory, chain(log.pairs)
-    assert np.sqrt(np.mean(_rotation_error_rad(log, fused) ** 2)) < 0.5 * np.sqrt(
-        np.mean(_rotation_error_rad(log, raw) ** 2)
-    )
+def test_a_gyro_makes_rotations_better_whether_it_has_a_bias_or_none(bias: float) -> None:
+    log = _log(2, 150, gyro_bias=np.array([bias, -bias, bias]))
+    fused = evaluate(posegraph.solve(log.pairs, log.inertial, CONFIG).trajectory, log.truth)
+    raw = evaluate(chain(log.pairs), log.truth)
+    assert fused.rpe_rotation_rad is not None
+    assert raw.rpe_rotation_rad is not None
+    assert fused.rpe_rotation_rad < 0.4 * raw.rpe_rotation_rad
 
 
 def test_the_imu_carries_the_trajectory_over_pairs_that_are_wildly_wrong() -> None:
-    """Preintegration is dead reckoning: half a second of it from a known velocity is good to centimetres."""
+    """Preintegration is dead reckoning: half a second of it from a known velocity is good to decimetres."""
     log = _log(3, 100)
     wrong = range(50, 55)
-    errors = np.random.default_rng(3).normal(size=(99, 6)) * [0.1, 0.1, 0.1, 0.5, 0.5, 0.5]
-    bad = _pairs(log.truth, errors, SIGMA)
+    bad = _pairs(log.truth, np.random.default_rng(3).normal(size=(99, 6)) * [0.1, 0.1, 0.1, 0.5, 0.5, 0.5], SIGMA)
     pairs = [bad[k] if k in wrong else pair for k, pair in enumerate(log.pairs)]
+    all_right = posegraph.solve(log.pairs, log.inertial, CONFIG).trajectory
     result = posegraph.solve(pairs, log.inertial, CONFIG)
-    assert result.pairs_rejected == len(wrong)
-    assert result.imu_rejected == 0
-    assert np.linalg.norm(result.trajectory.poses.translation[-1] - log.truth.poses.translation[-1]) < 0.5
-    assert np.linalg.norm(chain(pairs).poses.translation[-1] - log.truth.poses.translation[-1]) > 2.0
+    assert (result.pairs_rejected, result.imu_rejected) == (len(wrong), 0)
+    assert _distance_m(result.trajectory, all_right) < 0.3
+    assert _distance_m(chain(pairs), chain(log.pairs)) > 2.0
 
 
 def test_a_gyro_that_bursts_is_rejected_where_it_does() -> None:
@@ -117,9 +124,8 @@ def test_a_gyro_that_bursts_is_rejected_where_it_does() -> None:
     burst = np.where(abs(seconds - 5.05) < 0.05, 0.5, 0.0)
     rates = log.inertial.angular_velocity + burst[:, None] * [0.0, 1.0, 0.0]
     result = posegraph.solve(log.pairs, replace(log.inertial, angular_velocity=rates), CONFIG)
-    assert result.imu_rejected == 1
-    assert result.pairs_rejected == 0
-    assert np.max(_rotation_error_rad(log, result.trajectory)) < 0.02
+    assert (result.pairs_rejected, result.imu_rejected) == (0, 1)
+    assert _turned_rad(result.trajectory, log.truth, 45, 55) < 0.005
 
 
 def test_normalised_errors_are_those_of_a_consistent_estimator() -> None:
@@ -130,12 +136,12 @@ def test_normalised_errors_are_those_of_a_consistent_estimator() -> None:
     config = PoseGraphConfig(
         gyro_noise=1e-3, accelerometer_noise=0.05, pair_rotation_rate_sigma=1e-6, accelerometer_bias_sigma=0.05
     )
-    runs, nees = 24, []
+    runs, nees = 16, []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         log = _log(
             seed,
-            80,
+            60,
             gyro_bias=rng.normal(0.0, config.gyro_bias_sigma, 3),
             accelerometer_bias=rng.normal(0.0, config.accelerometer_bias_sigma, 3),
             gyro_noise=config.gyro_noise,
@@ -150,31 +156,30 @@ def test_normalised_errors_are_those_of_a_consistent_estimator() -> None:
         )
     lower, upper = chi2.ppf([0.001, 0.999], 3 * runs) / runs
     mean = np.mean(nees, axis=0)
+    print(mean,lower,upper)
     assert np.all(mean > lower), mean
     assert np.all(mean < upper), mean
 
 
 @pytest.mark.parametrize("length_s", [0.1, 1.0, 5.0])
 def test_over_a_hole_in_the_imu_the_pairs_carry_on(length_s: float) -> None:
-    log = _log(5, 200)
-    holed = _without(log.inertial, 7.0, 7.0 + length_s)
-    result = posegraph.solve(log.pairs, holed, CONFIG)
-    assert 0 <= result.imu_factors - (199 - 10 * length_s) <= 1 or result.imu_factors == 199 - 10 * length_s - 1
-    raw_m, fused_m = (
-        np.linalg.norm(each.poses.translation[-1] - log.truth.poses.translation[-1])
-        for each in (chain(log.pairs), result.trajectory)
-    )
-    assert fused_m < raw_m
+    """The steps that the hole touches have no factor; the trajectory is hardly another."""
+    log = _log(5, 120)
+    holed = posegraph.solve(log.pairs, _without(log.inertial, 4.0, 4.0 + length_s), CONFIG)
+    whole = posegraph.solve(log.pairs, log.inertial, CONFIG)
+    assert whole.imu_factors - holed.imu_factors == round(10 * length_s) + 2
+    assert _distance_m(holed.trajectory, whole.trajectory) < 0.5
+    assert _turned_rad(holed.trajectory, whole.trajectory) < 0.02
 
 
 def test_over_a_hole_in_the_pairs_the_imu_carries_on() -> None:
-    """During the hole the car turns: the raw chain does not know, the graph measures it."""
-    log = _log(6, 200)
-    pairs = [pair for k, pair in enumerate(log.pairs) if not 100 <= k < 120]
-    steps, holes = bridge_gaps(log.truth.stamps_ns, pairs, None)
-    assert holes == 1
+    """The car turns during the hole: the raw chain does not know, the graph measures it."""
+    log = _log(6, 150)
+    hole = range(70, 90)
+    steps, _ = bridge_gaps(log.truth.stamps_ns, [pair for k, pair in enumerate(log.pairs) if k not in hole], None)
     raw, fused = chain(steps), posegraph.solve(steps, log.inertial, CONFIG).trajectory
-    assert np.max(_rotation_error_rad(log, fused)) < 0.2 * np.max(_rotation_error_rad(log, raw))
+    assert _turned_rad(raw, log.truth, 70, 90) > 0.02
+    assert _turned_rad(fused, log.truth, 70, 90) < 0.005
 
 
 def test_an_imu_that_measured_next_to_nothing_is_left_out_and_the_note_says_so() -> None:

@@ -1,6 +1,6 @@
 """The simulated street, its camera, its IMU, and the logs and clips that come out."""
 
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,8 +22,8 @@ from fusion_io.simulation.motion import (
     imu_stamps,
     simulate_imu,
 )
-from fusion_io.simulation.street import Look, Path
-from fusion_io.simulation.textures import COLOURS, TILE_METRES, Surface, library
+from fusion_io.simulation.street import Look, Route
+from fusion_io.simulation.textures import COLOURS, TILE_METRES, TILES, Surface, library
 from fusion_io.simulation.world import World
 
 WIDTH, HEIGHT = 160, 48
@@ -52,7 +52,7 @@ def motion() -> Motion:
 
 @pytest.fixture(scope="module")
 def world(motion: Motion) -> World:
-    return World(7, Path(motion.sampled(), CAMERA_HEIGHT))
+    return World(7, Route(motion.sampled(), CAMERA_HEIGHT))
 
 
 def warp_error(source, source_depth, target, T_source_target: RigidTransform) -> float:
@@ -75,7 +75,7 @@ def test_depth_of_the_ground_is_that_of_a_plane():
     empty = Look.draw(np.random.default_rng(0))
     empty = Look(**{name: getattr(empty, name) for name in Look.__slots__} | {"houses": 0, "cars": 0, "plants": 0})
     motion = drive(0, 0.0, 3.0, DriveStyle(shake=0, slope=0, yaw_rate=0, speed_change_mps=0, camera_pitch_rad=0.05))
-    world = World(1, Path(motion.sampled(), CAMERA_HEIGHT), empty)
+    world = World(1, Route(motion.sampled(), CAMERA_HEIGHT), empty)
     pose = motion.poses(np.array([1.0]))[0]
     _, depth = world.render(pose.as_matrix(), K, WIDTH, HEIGHT)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
@@ -117,8 +117,8 @@ def test_images_are_band_limited(world, motion):
 def test_a_world_is_fixed_by_its_seed(world, motion):
     """The same seed and place look the same to the bit; another seed looks different."""
     pose = motion.poses(np.array([1.0]))[0].as_matrix()
-    path = Path(motion.sampled(), CAMERA_HEIGHT)
-    first, again, other = (w.render(pose, K, WIDTH, HEIGHT) for w in (world, World(7, path), World(8, path)))
+    route = Route(motion.sampled(), CAMERA_HEIGHT)
+    first, again, other = (w.render(pose, K, WIDTH, HEIGHT) for w in (world, World(7, route), World(8, route)))
     np.testing.assert_array_equal(first[0], again[0])
     np.testing.assert_array_equal(first[1], again[1])
     assert np.abs(first[0] - other[0]).mean() > 0.05
@@ -128,7 +128,7 @@ def test_a_second_lap_finds_the_street_of_the_first():
     """Driving a road twice builds the same street as driving it once."""
     angles = np.arange(0.0, 4 * np.pi, 0.02)
     laps = course(35.0 * np.column_stack([np.sin(angles), 1 - np.cos(angles)]))
-    once, twice = (World(5, Path(laps[:count], CAMERA_HEIGHT)) for count in (len(angles) // 2, len(angles)))
+    once, twice = (World(5, Route(laps[:count], CAMERA_HEIGHT)) for count in (len(angles) // 2, len(angles)))
     opposite = laps[len(angles) // 4].as_matrix()  # of the start: the straight roads beyond the ends are out of sight
     for first, second in zip(*(w.render(opposite, K, WIDTH, HEIGHT) for w in (once, twice)), strict=True):
         np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-4)
@@ -138,7 +138,7 @@ def test_the_camera_never_meets_anything():
     """However a path crosses itself, the nearest thing in any direction is a metre away."""
     angle = np.linspace(0, 2 * np.pi, 400)
     poses = course(np.column_stack([40 * np.sin(angle), 30 * np.sin(2 * angle)]))
-    world = World(11, Path(poses, CAMERA_HEIGHT))
+    world = World(11, Route(poses, CAMERA_HEIGHT))
     wide = np.array([[8.0, 0, 11.5], [0, 8.0, 7.5], [0, 0, 1]])
     for pose in poses[::36]:
         for turn in range(4):
@@ -152,7 +152,7 @@ def test_passages_at_two_heights_are_both_above_ground():
     angle = np.linspace(0, 4 * np.pi, 800)
     flat = course(50.0 * np.column_stack([np.sin(angle), 1 - np.cos(angle)]))
     poses = RigidTransform.from_translation(np.column_stack([0 * angle, 0 * angle, 0.4 * angle])) * flat
-    ground = Path(poses, CAMERA_HEIGHT).height(poses.translation[:, :2])
+    ground = Route(poses, CAMERA_HEIGHT).height(poses.translation[:, :2])
     assert (poses.translation[:, 2] - ground).min() > 0.8
 
 
@@ -166,7 +166,7 @@ def test_colour_and_grey_images_agree(world, motion):
 
 
 def test_every_surface_has_a_colour():
-    assert len(COLOURS) == Surface.FACADE + 12
+    assert len(COLOURS) == TILES
     np.testing.assert_allclose(COLOURS.mean(axis=1), 1.0, rtol=1e-6)
 
 
@@ -345,7 +345,7 @@ def test_stereo_sees_no_depth_left_of_near_things_nor_far_away():
 # ---------------------------------------------------------------------------------------------------- logs
 
 
-def simulate(out: FilePath, *arguments: str) -> int:
+def simulate(out: Path, *arguments: str) -> int:
     return convert.main(["simulate", "--out", str(out), *arguments])
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # and usage errors answer at once.
 
 #: What the error of a pair was, per axis (root mean square against ground truth), for a published visual
-#: odometry on KITTI 09: 0.043 m and 0.44 mrad, of which a few tenths are the ground truth's own.
+#: odometry on KITTI 09: 0.043 m and 0.44 mrad.
 SIGMA_TRANSLATION_M = 0.04
 SIGMA_ROTATION_RAD = 0.0005
 

@@ -43,9 +43,9 @@ def read_depth(path: Path, metres_per_unit: float) -> NDArray[np.float32] | None
 def _decode(path: Path, flags: int) -> NDArray[np.generic] | None:
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError:
+        image: NDArray[np.generic] | None = cv2.imdecode(data, flags) if data.size else None
+    except (OSError, cv2.error):
         return None
-    image: NDArray[np.generic] | None = cv2.imdecode(data, flags) if data.size else None
     return image
 
 

@@ -153,7 +153,7 @@ def open_raw(
     the unit's positions as GNSS fixes. Ground truth keeps the stamps of the OXTS records, and is that of
     the chosen left camera in the frame of its first pose.
     """
-    calibration = drive.resolve().parent if calibration is None else calibration
+    calibration = drive.absolute().parent if calibration is None else calibration
     if not drive.is_dir():
         raise LogError(f"{drive}: no such drive")
     cameras = _chosen_cameras(drive, "image_{:02d}", colour)

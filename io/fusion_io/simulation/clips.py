@@ -17,7 +17,7 @@ from fusion_io.simulation.motion import (
     imu_stamps,
     simulate_imu,
 )
-from fusion_io.simulation.street import Path
+from fusion_io.simulation.street import Route
 from fusion_io.simulation.textures import Float32
 from fusion_io.simulation.world import World, exposed, exposure
 
@@ -44,7 +44,7 @@ def clip(
     times = stamps / NANOSECONDS
     style = _style(rng)
     motion = drive(int(rng.integers(2**31)), times[0] - MOTION_MARGIN_S, times[-1] + MOTION_MARGIN_S, style)
-    world = World(int(rng.integers(2**31)), Path(motion.sampled(), style.camera_height_m))
+    world = World(int(rng.integers(2**31)), Route(motion.sampled(), style.camera_height_m))
     imager = _Imager(rng, world, _camera(rng, width, height), exact_depth)
     trajectory = Trajectory(stamps, motion.poses(times))
     taken = [imager.take(int(stamp), pose) for stamp, pose in zip(stamps, trajectory.poses.as_matrix(), strict=True)]

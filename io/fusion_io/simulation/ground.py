@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_io.records import FloatArray
-from fusion_io.simulation.street import Path, Polygons, _padded, _planes
+from fusion_io.simulation.street import Route, Polygons, padded, planes
 from fusion_io.simulation.textures import Float32, Surface
 
 CELL_METRES = 10.0  # of the net
@@ -21,15 +21,15 @@ MAP_REACH_METRES = 20.0  # beyond this from the path the ground is plain grass i
 FAR_METRES = 1e3  # the lateral coordinate where there is no road
 
 
-def build_ground(path: Path) -> Polygons:
+def build_ground(route: Route) -> Polygons:
     """Triangles over square cells wherever the path is near; their texture coordinates are the world's x and y."""
-    cells = _cells_near(path, CELL_METRES, REACH_METRES)
+    cells = _cells_near(route, CELL_METRES, REACH_METRES)
     corners = cells[:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     unique, inverse = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
     nodes = unique * CELL_METRES
-    squares = np.column_stack([nodes, path.height(nodes)])[inverse.reshape(-1, 4)]
-    triangles = _padded(np.concatenate([squares[:, [0, 1, 2]], squares[:, [0, 2, 3]]]))
-    _, normals = _planes(triangles)
+    squares = np.column_stack([nodes, route.height(nodes)])[inverse.reshape(-1, 4)]
+    triangles = padded(np.concatenate([squares[:, [0, 1, 2]], squares[:, [0, 2, 3]]]))
+    _, normals = planes(triangles)
     count = len(triangles)
     return Polygons(
         triangles,
@@ -42,27 +42,27 @@ def build_ground(path: Path) -> Polygons:
     )
 
 
-def _cells_near(path: Path, cell: float, reach: float) -> NDArray[np.int64]:
+def _cells_near(route: Route, cell: float, reach: float) -> NDArray[np.int64]:
     """Indices (N, 2) of the square cells within reach of the path, sorted."""
     span = int(np.ceil(reach / cell))
     window = np.indices((2 * span + 1, 2 * span + 1)).reshape(2, -1).T - span
-    stations = np.unique(np.floor(path.points / cell).astype(np.int64), axis=0)
+    stations = np.unique(np.floor(route.points / cell).astype(np.int64), axis=0)
     cells = np.unique((stations[:, None] + window).reshape(-1, 2), axis=0)
-    distance, _ = path.tree.query((cells + 0.5) * cell)
+    distance, _ = route.tree.query((cells + 0.5) * cell)
     return np.asarray(cells[distance < reach + 0.71 * cell])
 
 
 class GroundMap:
     """The ground from above, in tiles near the path: road coordinates and sunlight."""
 
-    def __init__(self, path: Path, shadows: Sequence[FloatArray]) -> None:
+    def __init__(self, route: Route, shadows: Sequence[FloatArray]) -> None:
         """shadows: convex outlines (n, 2) in world metres."""
-        tiles = _cells_near(path, TILE_CELLS, MAP_REACH_METRES)
+        tiles = _cells_near(route, TILE_CELLS, MAP_REACH_METRES)
         self._low = tiles.min(axis=0).astype(np.int32)
         # One column and row more, and one tile more, stand for everywhere else.
         self._slots = np.full(tiles.max(axis=0) - self._low + 2, len(tiles), np.int32)
         self._slots[tuple((tiles - self._low).T)] = np.arange(len(tiles))
-        self._lateral, self._along = _road_coordinates(path, tiles)
+        self._lateral, self._along = _road_coordinates(route, tiles)
         self._sunlight = _sunlight(tiles, shadows)
 
     def lookup(self, x: Float32, y: Float32) -> tuple[Float32, Float32, Float32]:
@@ -83,7 +83,7 @@ class GroundMap:
         return road.blend(self._lateral), road.blend(self._along), shade.blend(self._sunlight)
 
 
-def _road_coordinates(path: Path, tiles: NDArray[np.int64]) -> tuple[Float32, Float32]:
+def _road_coordinates(route: Route, tiles: NDArray[np.int64]) -> tuple[Float32, Float32]:
     """Lateral and along on every tile's grid, each (tiles + 1, 17, 17), from the nearest station of a road.
 
     Along is NaN at seams between roads, where the coordinates must not be interpolated.
@@ -91,12 +91,12 @@ def _road_coordinates(path: Path, tiles: NDArray[np.int64]) -> tuple[Float32, Fl
     steps = np.arange(TILE_CELLS + 1.0)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
     points = (tiles[:, None, None] * TILE_CELLS + grid).reshape(-1, 2)
-    roads = np.flatnonzero(path.is_new)
-    distance, nearest = cKDTree(path.points[roads]).query(points, distance_upper_bound=1.5 * MAP_REACH_METRES)
+    roads = np.flatnonzero(route.is_new)
+    distance, nearest = cKDTree(route.points[roads]).query(points, distance_upper_bound=1.5 * MAP_REACH_METRES)
     station = roads[np.minimum(nearest, len(roads) - 1)]
-    offset = points - path.points[station]
-    lateral = np.einsum("ij,ij->i", offset, path.normals[station])
-    along = path.distances[station] + np.einsum("ij,ij->i", offset, path.tangents[station])
+    offset = points - route.points[station]
+    lateral = np.einsum("ij,ij->i", offset, route.normals[station])
+    along = route.distances[station] + np.einsum("ij,ij->i", offset, route.tangents[station])
     lateral[distance > MAP_REACH_METRES] = FAR_METRES
     shape = (len(tiles), len(steps), len(steps))
     lateral, along = lateral.reshape(shape), along.reshape(shape)

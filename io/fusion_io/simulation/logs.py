@@ -14,7 +14,7 @@ from fusion_io.errors import LogError
 from fusion_io.recording import Recording, between
 from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, FloatArray, ImuSeries, IntArray, Trajectory
 from fusion_io.simulation.motion import DriveStyle, ImuModel, Motion, drive, imu_stamps, simulate_imu
-from fusion_io.simulation.street import Path as Street
+from fusion_io.simulation.street import Route
 from fusion_io.simulation.world import World, exposed, exposure
 
 START_S = 1.0  # the first frame's stamp: IMU samples before it have stamps above zero
@@ -55,7 +55,7 @@ def simulate_drive(setup: Setup, seconds: float, frame_rate_hz: float) -> Record
     imu = simulate_imu(motion, imu_stamps(start, end, setup.imu_rate_hz), setup.imu_rate_hz, setup.imu, setup.seed)
     poses = motion.poses(stamps / NANOSECONDS)
     truth = Trajectory(stamps, poses).relative_to_first()
-    return _recording(setup, stamps, poses, Street(motion.sampled(), CAMERA_HEIGHT_M), truth, imu)
+    return _recording(setup, stamps, poses, Route(motion.sampled(), CAMERA_HEIGHT_M), truth, imu)
 
 
 def simulate_along(
@@ -75,7 +75,7 @@ def simulate_along(
     end_ns = int(trajectory.stamps_ns[-1] if seconds is None else trajectory.stamps_ns[0] + seconds * NANOSECONDS)
     chosen = int(np.searchsorted(trajectory.stamps_ns, end_ns, side="right" if seconds is None else "left"))
     levelled = _levelled(trajectory.poses)
-    street = Street(levelled, CAMERA_HEIGHT_M)  # the whole one: its look must not depend on how much is driven
+    route = Route(levelled, CAMERA_HEIGHT_M)  # the whole one: its look must not depend on how much is driven
     truth = Trajectory(trajectory.stamps_ns[:chosen], trajectory.poses[:chosen])
     first_ns, last_ns = int(truth.stamps_ns[0]), int(truth.stamps_ns[-1])
     if imu_file is not None and stamps is not None:
@@ -84,7 +84,7 @@ def simulate_along(
         motion = Motion(trajectory.stamps_ns / NANOSECONDS, levelled)
         times = imu_stamps(first_ns / NANOSECONDS, last_ns / NANOSECONDS, setup.imu_rate_hz)
         imu = simulate_imu(motion, times, setup.imu_rate_hz, setup.imu, setup.seed)
-    return _recording(setup, truth.stamps_ns, levelled[:chosen], street, truth, imu)
+    return _recording(setup, truth.stamps_ns, levelled[:chosen], route, truth, imu)
 
 
 def _levelled(poses: RigidTransform) -> RigidTransform:
@@ -103,9 +103,9 @@ def _levelled(poses: RigidTransform) -> RigidTransform:
 
 
 def _recording(
-    setup: Setup, stamps: IntArray, poses: RigidTransform, street: Street, truth: Trajectory, imu: ImuSeries
+    setup: Setup, stamps: IntArray, poses: RigidTransform, route: Route, truth: Trajectory, imu: ImuSeries
 ) -> Recording:
-    world = World(setup.seed, street)
+    world = World(setup.seed, route)
     return Recording(
         frames=_frames(setup, world, stamps, poses.as_matrix()),
         frame_count=len(stamps),

@@ -81,7 +81,7 @@ class Look:
         )
 
 
-class Path:
+class Route:
     """Where the camera passes, as stations every half metre: points on the ground, tangents, normals.
 
     distances (N,) along; points (N, 2); tangents, normals (to the left) (N, 2); is_new (N,) is
@@ -135,7 +135,7 @@ class Path:
         return np.asarray((weights * self._heights[index]).sum(axis=1) / weights.sum(axis=1))
 
     def is_clear(self, centre: FloatArray, axes: FloatArray, half: FloatArray, margin: float) -> bool:
-        """Whether a rectangle stays ``margin`` away from the path.
+        """Whether a rectangle stays ``margin`` away from the route.
 
         centre (2,), axes (2, 2) unit rows, half (2,) its half lengths along them.
         """
@@ -183,11 +183,11 @@ class Polygons:
 MAX_CORNERS = 5
 
 
-def _padded(corners: FloatArray) -> FloatArray:
+def padded(corners: FloatArray) -> FloatArray:
     return np.concatenate([corners, np.repeat(corners[:, -1:], MAX_CORNERS - corners.shape[1], axis=1)], axis=1)
 
 
-def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+def planes(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Axes (F, 2, 3) in the polygon's plane, the first along its first edge, and normals (F, 3)."""
     along = corners[:, 1] - corners[:, 0]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -209,7 +209,7 @@ class _Collector:
     ) -> None:
         """Polygons (n, k, 3) of one surface; tint (3,) or (n, 3); shifts: one number or (n, 2)."""
         count = len(corners)
-        self.corners.append(_padded(corners))
+        self.corners.append(padded(corners))
         self.shifts.append(np.broadcast_to(shifts, (count, 2)))
         look = np.empty((count, 5))
         look[:, 0], look[:, 1], look[:, 2:] = surface, scale, tint
@@ -219,7 +219,7 @@ class _Collector:
         """All polygons, lit by the world's sun and sky."""
         corners = np.concatenate([np.zeros((0, MAX_CORNERS, 3)), *self.corners])
         looks = np.concatenate([np.zeros((0, 5)), *self.looks])
-        axes, normals = _planes(corners)
+        axes, normals = planes(corners)
         light = look.ambient + (1.0 - look.ambient) * np.clip(normals @ look.sun, 0.0, None)
         light *= 0.9 + 0.1 * normals[:, 2]  # the sky is brighter than the ground
         return Polygons(
@@ -260,18 +260,18 @@ def _tint(rng: np.random.Generator, low: float, high: float, colour: float) -> F
 class _Site:
     """A place on the ground with a heading: turns local coordinates (x along, y left, z up) into the world's."""
 
-    def __init__(self, path: Path, centre: FloatArray, heading: float) -> None:
-        self._path, self.centre = path, centre
+    def __init__(self, route: Route, centre: FloatArray, heading: float) -> None:
+        self._route, self.centre = route, centre
         c, s = np.cos(heading), np.sin(heading)
         self.axes = np.array([[c, s], [-s, c]])
 
     def is_clear(self, length: float, width: float, margin: float) -> bool:
         """Whether a rectangle here keeps its distance from everywhere the camera passes."""
-        return self._path.is_clear(self.centre, self.axes, 0.5 * np.array([length, width]), margin)
+        return self._route.is_clear(self.centre, self.axes, 0.5 * np.array([length, width]), margin)
 
     def settle(self) -> None:
         """Finds the ground; to be called before ``points``."""
-        self._ground = float(self._path.height(self.centre[None])[0])
+        self._ground = float(self._route.height(self.centre[None])[0])
 
     def points(self, local: FloatArray) -> FloatArray:
         """Local points (..., 3) in the world."""
@@ -288,8 +288,8 @@ class _Site:
 class Builder:
     """Places things; every one leaves polygons, and the outline of its shadow on the ground."""
 
-    def __init__(self, path: Path, look: Look) -> None:
-        self._path, self._look = path, look
+    def __init__(self, route: Route, look: Look) -> None:
+        self._route, self._look = route, look
         self._collector = _Collector()
         self.shadows: list[FloatArray] = []
 
@@ -325,7 +325,7 @@ class Builder:
 
     def house(self, rng: np.random.Generator, centre: FloatArray, heading: float, length: float) -> None:
         """A house with a pitched or flat roof."""
-        site = _Site(self._path, centre, heading)
+        site = _Site(self._route, centre, heading)
         depth, height = rng.uniform(7.0, 12.0), rng.uniform(3.2, 10.0)
         if not site.is_clear(length, depth, HOUSE_CLEARANCE):
             return
@@ -364,7 +364,7 @@ class Builder:
 
     def car(self, rng: np.random.Generator, centre: FloatArray, heading: float) -> None:
         """A car or van: body, cabin, shadowed underside, wheels, lights and number plates."""
-        site = _Site(self._path, centre, heading)
+        site = _Site(self._route, centre, heading)
         if rng.random() < 0.2:  # a van
             length, width, waist, roof = rng.uniform(4.6, 5.6), 1.95, 1.2, 2.1
             cabin, back = 0.9 * length, 0.0
@@ -395,7 +395,7 @@ class Builder:
 
     def hedge(self, rng: np.random.Generator, centre: FloatArray, heading: float, length: float) -> None:
         """A hedge, a garden wall or a fence."""
-        site = _Site(self._path, centre, heading)
+        site = _Site(self._route, centre, heading)
         kind = int(rng.choice(3, p=[0.5, 0.25, 0.25]))
         surface = (Surface.FOLIAGE, Surface.STONE, Surface.FENCE)[kind]
         thickness, height = (rng.uniform(0.5, 1.0), 0.25, 0.06)[kind], rng.uniform(0.7, 1.9)
@@ -423,7 +423,7 @@ class Builder:
 
     def _crown(self, rng: np.random.Generator, centre: FloatArray, height: float, radii: FloatArray) -> None:
         """Leaves: a dodecahedron stretched to the radii (3,), its middle ``height`` above the ground."""
-        site = _Site(self._path, centre, rng.uniform(0, 2 * np.pi))
+        site = _Site(self._route, centre, rng.uniform(0, 2 * np.pi))
         if not site.is_clear(2 * radii[0], 2 * radii[1], THING_CLEARANCE):
             return
         site.settle()
@@ -446,7 +446,7 @@ class Builder:
         self, rng: np.random.Generator, centre: FloatArray, girth: float, height: float, surface: int, tint: FloatArray
     ) -> _Site | None:
         """Something upright and thin; None where it would be in the way."""
-        site = _Site(self._path, centre, rng.uniform(0, 2 * np.pi))
+        site = _Site(self._route, centre, rng.uniform(0, 2 * np.pi))
         if not site.is_clear(girth, girth, THING_CLEARANCE):
             return None
         site.settle()
@@ -455,14 +455,14 @@ class Builder:
         return site
 
 
-def build_street(path: Path, look: Look, seed: int) -> tuple[Polygons, list[FloatArray]]:
+def build_street(route: Route, look: Look, seed: int) -> tuple[Polygons, list[FloatArray]]:
     """Everything that stands along the path, and the outlines (n, 2) of the shadows on the ground."""
-    builder = Builder(path, look)
-    for station in range(0, len(path.points), int(LOT_METRES / STATION_METRES)):
-        if not path.is_new[station]:
+    builder = Builder(route, look)
+    for station in range(0, len(route.points), int(LOT_METRES / STATION_METRES)):
+        if not route.is_new[station]:
             continue
         for side in (1, -1):
-            _furnish(builder, _place_generator(seed, path.points[station], side), path, look, station, side)
+            _furnish(builder, _place_generator(seed, route.points[station], side), route, look, station, side)
     return builder.build(), builder.shadows
 
 
@@ -472,16 +472,16 @@ def _place_generator(seed: int, point: FloatArray, side: int) -> np.random.Gener
     return np.random.default_rng([seed, side + 1, *(int(c) & 0xFFFFFFFF for c in cell)])
 
 
-def _furnish(builder: Builder, rng: np.random.Generator, path: Path, look: Look, station: int, side: int) -> None:
+def _furnish(builder: Builder, rng: np.random.Generator, route: Route, look: Look, station: int, side: int) -> None:
     """One lot on one side (1 left, -1 right): a house or a garden, what stands before it, what is parked."""
-    heading = float(np.arctan2(path.tangents[station, 1], path.tangents[station, 0]))
+    heading = float(np.arctan2(route.tangents[station, 1], route.tangents[station, 0]))
     kerb = look.road_left_m if side > 0 else look.road_right_m
     fence_line = kerb + look.paving_m + 0.4
     middle = 0.5 * LOT_METRES
 
     def spot(along: float, lateral: float) -> FloatArray:
-        index = min(station + int(along / STATION_METRES), len(path.points) - 1)
-        return np.asarray(path.points[index] + side * lateral * path.normals[index])
+        index = min(station + int(along / STATION_METRES), len(route.points) - 1)
+        return np.asarray(route.points[index] + side * lateral * route.normals[index])
 
     setback = rng.choice([0.0, rng.uniform(1.0, 3.0), rng.uniform(3.0, 8.0)])
     if rng.random() < look.houses:

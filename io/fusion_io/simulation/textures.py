@@ -26,7 +26,7 @@ LIBRARY_SEED = 20110926  # the tiles are the same in all worlds; worlds differ i
 
 
 class Surface(IntEnum):
-    """Index of the tile of a surface; facades are the last ``FACADES`` tiles."""
+    """The tile of a surface; facades are this one and the ``FACADES - 1`` that follow."""
 
     ASPHALT = 0
     PAVING = 1
@@ -43,25 +43,23 @@ class Surface(IntEnum):
     FACADE = 12
 
 
-# RGB of each surface beside its grey tile, with a mean of one.
-COLOURS = np.array(
-    [
-        (1.00, 1.00, 1.03),
-        (1.04, 1.00, 0.95),
-        (0.90, 1.15, 0.60),
-        (0.80, 1.15, 0.60),
-        (1.30, 0.90, 0.75),
-        (1.05, 1.00, 0.92),
-        (1.00, 1.00, 1.00),
-        (0.95, 1.00, 1.08),
-        (1.15, 1.00, 0.80),
-        (1.00, 1.00, 1.00),
-        (1.10, 1.00, 0.85),
-        (1.00, 1.00, 1.00),
-        *[(1.05, 1.00, 0.92)] * FACADES,
-    ],
-    np.float32,
-)
+TILES = Surface.FACADE + FACADES
+
+
+_HUES = {  # RGB beside the grey tile; grey where nothing is said
+    Surface.ASPHALT: (1.00, 1.00, 1.03),
+    Surface.PAVING: (1.04, 1.00, 0.95),
+    Surface.GRASS: (0.90, 1.15, 0.60),
+    Surface.FOLIAGE: (0.80, 1.15, 0.60),
+    Surface.ROOF: (1.30, 0.90, 0.75),
+    Surface.STONE: (1.05, 1.00, 0.92),
+    Surface.GLASS: (0.95, 1.00, 1.08),
+    Surface.WOOD: (1.15, 1.00, 0.80),
+    Surface.FENCE: (1.10, 1.00, 0.85),
+    Surface.FACADE: (1.05, 1.00, 0.92),
+}
+# One row a tile, with a mean of one, so that a colour image is as bright as a grey one.
+COLOURS = np.array([_HUES.get(Surface(min(tile, Surface.FACADE)), (1, 1, 1)) for tile in range(TILES)], np.float32)
 COLOURS /= COLOURS.mean(axis=1, keepdims=True)
 
 
@@ -167,24 +165,21 @@ class Textures:
     """
 
     def __init__(self) -> None:
-        tiles = _tiles()
+        sizes = TILE_TEXELS >> np.arange(LEVELS)
+        below = np.cumsum(sizes[1:] + 2) - (sizes[1:] + 2)
+        level_rows, level_columns = np.append(0, below), np.where(sizes == TILE_TEXELS, 0, TILE_TEXELS + 2)
         band, width = TILE_TEXELS + 2 * LEVELS, TILE_TEXELS + 2 + TILE_TEXELS // 2 + 2
-        self._image = np.zeros((band * len(tiles), width), np.float32)
-        places = [(0, 0)]
-        for level in range(1, LEVELS):
-            places.append((places[-1][0] + (TILE_TEXELS >> (level - 1)) + 2 if level > 1 else 0, TILE_TEXELS + 2))
-        for index, tile in enumerate(tiles):
-            clipped = np.clip(tile, 0.02, 1.0).astype(np.float32)
-            for level, (row, column) in enumerate(places):
-                size = TILE_TEXELS >> level
-                small = cv2.resize(clipped, (size, size), interpolation=cv2.INTER_AREA)
-                rows = slice(index * band + row, index * band + row + size + 2)
-                self._image[rows, column : column + size + 2] = np.pad(small, 1, mode="wrap")
-        # Texel centres are integers in remap: the middle of a level's first texel is half a texel in.
-        self._rows = np.array([[index * band + row + 0.5 for row, _ in places] for index in range(len(tiles))]).ravel()
-        self._columns = np.array([column + 0.5 for _, column in places] * len(tiles))
-        self._rows, self._columns = self._rows.astype(np.float32), self._columns.astype(np.float32)
-        self._sizes = (TILE_TEXELS >> np.arange(LEVELS)).astype(np.float32)
+        self._image = np.zeros((band * TILES, width), np.float32)
+        for tile, values in zip(self._image.reshape(TILES, band, width), _tiles(), strict=True):
+            clipped = np.clip(values, 0.02, 1.0).astype(np.float32)
+            for row, column, size in zip(level_rows, level_columns, sizes, strict=True):
+                level = cv2.resize(clipped, (int(size), int(size)), interpolation=cv2.INTER_AREA)
+                tile[row : row + size + 2, column : column + size + 2] = np.pad(level, 1, mode="wrap")
+        # Where the levels of all tiles begin. Texel centres are integers in remap, so the edge of a
+        # level's first texel, behind the border, is at a half.
+        self._rows = (band * np.arange(TILES)[:, None] + level_rows + 0.5).ravel().astype(np.float32)
+        self._columns = np.tile(level_columns + 0.5, TILES).astype(np.float32)
+        self._sizes = sizes.astype(np.float32)
 
     def lookup(self, surface: NDArray[np.int32], u: Float32, v: Float32, octave: Float32) -> Float32:
         """Albedo (N,) at u, v (N,) metres on the tiles ``surface`` (N,) or (1,).

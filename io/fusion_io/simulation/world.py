@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusion_io.records import FloatArray
 from fusion_io.simulation.ground import CELL_METRES, GroundMap, build_ground
-from fusion_io.simulation.street import Look, Path, Polygons, build_street
+from fusion_io.simulation.street import Look, Route, Polygons, build_street
 from fusion_io.simulation.textures import COLOURS, Float32, Surface, library
 
 VIEW_METRES = 120.0  # nothing further away is drawn
@@ -26,14 +26,14 @@ TENT = np.array([0.25, 0.5, 0.25], np.float32)  # the pixel's filter over sample
 class World:
     """A street along a path, fixed by seed and place."""
 
-    def __init__(self, seed: int, path: Path, look: Look | None = None) -> None:
-        """path: where the camera passes; look: drawn from the seed unless given."""
+    def __init__(self, seed: int, route: Route, look: Look | None = None) -> None:
+        """route: where the camera passes; look: drawn from the seed unless given."""
         self.look = look or Look.draw(np.random.default_rng([seed, 1]))
         self._offset = np.random.default_rng([seed, 2]).uniform(0, 100, 2).astype(np.float32)
         self._tones = np.exp(np.random.default_rng([seed, 3]).normal(0, 0.2, 3)).astype(np.float32)
-        street, shadows = build_street(path, self.look, seed)
-        self._ground_map = GroundMap(path, shadows)
-        self._polygons = Polygons.joined([build_ground(path), street])
+        street, shadows = build_street(route, self.look, seed)
+        self._ground_map = GroundMap(route, shadows)
+        self._polygons = Polygons.joined([build_ground(route), street])
         self._index = _index_by_place(self._polygons)
 
     def render(
