@@ -132,7 +132,7 @@ def covers(trajectory: Trajectory, stamps_ns: IntArray) -> NDArray[np.bool_]:
 
 
 def interpolate(trajectory: Trajectory, stamps_ns: IntArray) -> Trajectory:
-    """The trajectory at other stamps (N,) within its own, linear in position, slerp in rotation, without covariances."""
+    """The trajectory at stamps (N,) within its own, linear in position, slerp in rotation, without covariances."""
     seconds = (trajectory.stamps_ns - trajectory.stamps_ns[0]) / NANOSECONDS
     queries = (stamps_ns - trajectory.stamps_ns[0]) / NANOSECONDS
     positions = trajectory.poses.translation

@@ -89,7 +89,7 @@ def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: Pos
     weighed = _weigh(steps, gyro)
     try:
         trajectory = solve_inertial(weighed, used, gyro, config)
-    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException
+    except RuntimeError as error:  # IndeterminantLinearSystemException of GTSAM, for one
         reason = " ".join(str(error).split())
         return PoseGraphResult(solve_pairs(steps), f"pairs only: the graph with the IMU has no solution ({reason})")
     imu_rejected, pairs_rejected = int(gyro.imu_wrong.sum()), int(gyro.pair_wrong.sum())
@@ -281,6 +281,8 @@ def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps_ns
     tree = gtsam.ISAM2(elimination)
     tree.update(graph, solution)
     poses = np.stack([solution.atPose3(X(k)).matrix() for k in range(len(stamps_ns))])
+    if not np.all(np.isfinite(poses)):
+        raise RuntimeError("the solution is not finite")
     covariances = np.stack([tree.marginalCovariance(X(k)) for k in range(len(stamps_ns))])
     covariances[0] = 0.0  # the world itself
     return Trajectory(stamps_ns, RigidTransform.from_matrix(poses), covariances)

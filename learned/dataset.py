@@ -106,7 +106,13 @@ def simulated_shard(seeds: range, frames: int, config: NetworkConfig, path: Path
 
 
 def simulate_shards(
-    folder: Path, clips: int, frames: int, first_seed: int, config: NetworkConfig, workers: int, clips_a_shard: int = CLIPS_A_SHARD
+    folder: Path,
+    clips: int,
+    frames: int,
+    first_seed: int,
+    config: NetworkConfig,
+    workers: int,
+    clips_a_shard: int = CLIPS_A_SHARD,
 ) -> Iterator[Path]:
     """Render all clips, a shard a task, yielding each file as it is finished (in order of the seeds)."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -42,6 +42,7 @@ class Recipe:
     validation_share: float = 0.05
     validate_every: int = 250
     imu_dropout: float = 0.1
+    calibration_clips: int = 64
 
 
 RECIPES = {
@@ -56,8 +57,6 @@ MOMENTA = (0.9, 0.99)
 WARM_UP_STEPS = 100
 CALIBRATION_SEED = 7_000_000
 """Clips of the covariance fit and the final figures: never seen in training or validation."""
-
-CALIBRATION_CLIPS = 64
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -109,10 +108,10 @@ def train(preset: str, recipe: Recipe, out: Path, seed: int, workers: int, threa
     standardise_imu(model, training)
     optimise(model, recipe, training, validation, out, seed, device)
 
-    calibration = simulated(model, out / "calibration", CALIBRATION_CLIPS, recipe, CALIBRATION_SEED, workers)
+    calibration = simulated(model, out / "calibration", recipe.calibration_clips, recipe, CALIBRATION_SEED, workers)
     model.eval()
     covariance, figures = calibrate(model, calibration, device)
-    print("held-out simulation: " + ", ".join(f"{k} {v}" for k, v in figures.items()), file=sys.stderr)
+    print("held-out simulation: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()), file=sys.stderr)
     path = out / f"{preset}.pt"
     weights.save(path, model, covariance, {"seed": seed, "recipe": asdict(recipe), "held_out": figures})
     return path
@@ -129,7 +128,9 @@ def simulated(model: VIOLearner, folder: Path, clips: int, recipe: Recipe, first
     from learned.dataset import CLIPS_A_SHARD, Pairs, simulate_shards
 
     shards = simulate_shards(folder, clips, recipe.frames_a_clip, first_seed, model.config, workers)
-    return Pairs.concatenate(Pairs.load(path) for path in track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD)))
+    return Pairs.concatenate(
+        Pairs.load(path) for path in track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD))
+    )
 
 
 def split(pairs: Pairs, count: int) -> tuple[Pairs, Pairs]:

@@ -156,7 +156,6 @@ def test_normalised_errors_are_those_of_a_consistent_estimator() -> None:
         )
     lower, upper = chi2.ppf([0.001, 0.999], 3 * runs) / runs
     mean = np.mean(nees, axis=0)
-    print(mean,lower,upper)
     assert np.all(mean > lower), mean
     assert np.all(mean < upper), mean
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_io.records import FloatArray
-from fusion_io.simulation.street import Route, Polygons, padded, planes
+from fusion_io.simulation.street import Polygons, Route, padded, planes
 from fusion_io.simulation.textures import Float32, Surface
 
 CELL_METRES = 10.0  # of the net

@@ -20,7 +20,7 @@ from fusion_io.records import FloatArray
 from fusion_io.simulation.textures import FACADES, TILE_METRES, Surface
 
 STATION_METRES = 0.5  # spacing of the path's stations
-HEIGHT_STRIDE = 8  # the ground's height is blended from every eighth station
+HEIGHT_METRES = 4.0  # spacing of the heights that the ground is blended from
 ROAD_BEHIND_METRES = 30.0  # the road goes on, straight, before the path's start
 ROAD_AHEAD_METRES = 130.0  # and after its end
 REVISIT_METRES = 7.0  # a path this close to an earlier part of itself runs on the same road
@@ -94,10 +94,12 @@ class Route:
         ground = poses.translation - [0.0, 0.0, camera_height_m]
         ground = ground[_apart(ground[:, :2], STATION_METRES)]
         headings = poses.rotation[[0, -1]].apply([0.0, 0.0, 1.0])[:, :2]
+        headings += [1e-9, 0.0]  # a camera that looks straight down has no heading: any will do
         headings /= np.linalg.norm(headings, axis=1, keepdims=True)
-        behind = ground[0, :2] - np.arange(ROAD_BEHIND_METRES, 0.0, -1.0)[:, None] * headings[0]
-        ahead = ground[-1, :2] + np.arange(1.0, ROAD_AHEAD_METRES)[:, None] * headings[1]
-        course = np.concatenate([behind, ground[:, :2], ahead])
+        behind = ground[0, :2] - ROAD_BEHIND_METRES * headings[0]
+        ahead = ground[-1, :2] + ROAD_AHEAD_METRES * headings[1]
+        course = np.concatenate([behind[None], ground[:, :2], ahead[None]])
+        heights = np.concatenate([ground[:1, 2], ground[:, 2], ground[-1:, 2]])
 
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(course, axis=0), axis=1))])
         self.distances = np.arange(0.0, along[-1], STATION_METRES)
@@ -107,8 +109,11 @@ class Route:
         self.normals = np.column_stack([-self.tangents[:, 1], self.tangents[:, 0]])
         self.tree = cKDTree(self.points)
         self.is_new = self._find_new()
-        self._heights_tree = cKDTree(ground[::HEIGHT_STRIDE, :2])
-        self._heights = self._lowest(ground[::HEIGHT_STRIDE, 2])
+        # Heights come from where the camera was; the roads beyond are as high as what is near them.
+        measured = np.arange(along[1], along[-2] + HEIGHT_METRES, HEIGHT_METRES)
+        course_at = [np.interp(measured, along, course[:, axis]) for axis in (0, 1)]
+        self._heights_tree = cKDTree(np.column_stack(course_at))
+        self._heights = self._lowest(np.interp(measured, along, heights))
 
     def _lowest(self, heights: FloatArray) -> FloatArray:
         """The heights (N,), or those of another passage nearby that is lower.
@@ -116,7 +121,7 @@ class Route:
         A recorded path may come back to a place at another height, by drift or over a bridge. The
         ground must then be below both.
         """
-        gap = REVISIT_GAP_METRES / (HEIGHT_STRIDE * STATION_METRES)
+        gap = REVISIT_GAP_METRES / HEIGHT_METRES
         lowest = heights.copy()
         for i, j in self._heights_tree.query_pairs(CROSSING_METRES, output_type="ndarray"):
             if abs(i - j) > gap:
@@ -184,6 +189,7 @@ MAX_CORNERS = 5
 
 
 def padded(corners: FloatArray) -> FloatArray:
+    """Corners (F, k, 3) as (F, 5, 3), the last one repeated."""
     return np.concatenate([corners, np.repeat(corners[:, -1:], MAX_CORNERS - corners.shape[1], axis=1)], axis=1)
 
 

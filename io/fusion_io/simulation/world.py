@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusion_io.records import FloatArray
 from fusion_io.simulation.ground import CELL_METRES, GroundMap, build_ground
-from fusion_io.simulation.street import Look, Route, Polygons, build_street
+from fusion_io.simulation.street import Look, Polygons, Route, build_street
 from fusion_io.simulation.textures import COLOURS, Float32, Surface, library
 
 VIEW_METRES = 120.0  # nothing further away is drawn
