@@ -78,7 +78,7 @@ class PoseGraphConfig(Section):
     errors of the pairs that are correlated in time. *_bias_walk: how biases wander (rad/s^2, m/s^3, per sqrt(Hz)).
     *_bias_sigma: how far they may be from zero (rad/s, m/s^2); corrected_gyro_bias_sigma where a navigation system
     has removed the gyro's already. pair_rotation_rate_sigma (rad/s): constant rate errors that a front end is taken
-    to be capable of. gate_probability: how seldom noise alone rejects the IMU over one step.
+    to be capable of. gate_probability: how seldom noise alone makes IMU and pair contradict each other over one step.
     """
 
     gyro_noise: PositiveFloat = 1e-3

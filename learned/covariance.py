@@ -18,7 +18,6 @@ from scipy.spatial.transform import RigidTransform
 
 from fusion_io.records import FloatArray
 
-
 LEAST_GROWTH = 0.1
 """A pair without its IMU never counts as surer than one with it."""
 

@@ -17,7 +17,6 @@ from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, Trajectory
 from learned.inputs import NetworkFrame, imu_coverage, imu_window, prepare, to_unit
 from learned.violearner import Batch, NetworkConfig
 
-
 CLIPS_A_SHARD = 32
 
 
@@ -116,7 +115,7 @@ def simulate_shards(
 ) -> Iterator[Path]:
     """Render all clips, a shard a task, yielding each file as it is finished (in order of the seeds)."""
     folder.mkdir(parents=True, exist_ok=True)
-    stops = [*range(0, clips, clips_a_shard), clips]
+    stops = [*range(0, clips, CLIPS_A_SHARD), clips]
     with ProcessPoolExecutor(workers, initializer=single_thread) as pool:
         tasks = []
         for start, stop in pairwise(stops):

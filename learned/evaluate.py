@@ -43,10 +43,10 @@ def evaluate(path: Path, weights: Path | None = None) -> tuple[dict[str, Any], b
     from collections import Counter
 
     import numpy as np
-    from fusion_io.reader import open_log
 
     from fusion_io.errors import LogError
     from fusion_io.progress import track
+    from fusion_io.reader import open_log
     from learned import weights as weights_file
     from learned.covariance import mean_nees, pose_errors
     from learned.estimator import infer

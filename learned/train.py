@@ -128,9 +128,8 @@ def simulated(model: VIOLearner, folder: Path, clips: int, recipe: Recipe, first
     from learned.dataset import CLIPS_A_SHARD, Pairs, simulate_shards
 
     shards = simulate_shards(folder, clips, recipe.frames_a_clip, first_seed, model.config, workers)
-    return Pairs.concatenate(
-        Pairs.load(path) for path in track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD))
-    )
+    paths = track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD))
+    return Pairs.concatenate(Pairs.load(path) for path in paths)
 
 
 def split(pairs: Pairs, count: int) -> tuple[Pairs, Pairs]:

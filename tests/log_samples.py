@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.writer import Writer
+from scipy.spatial.transform import RigidTransform, Rotation
+
 from fusion_io import messages
 from fusion_io.records import CameraFrame, CameraInfo, ImuSeries, PairEstimate, Trajectory
 from fusion_io.writer import LogWriter
-from mcap.writer import Writer
-from scipy.spatial.transform import RigidTransform, Rotation
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

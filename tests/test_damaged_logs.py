@@ -4,17 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_samples import SECOND, START, camera_info, depth, frames, imu_series, pair_estimates, raw_image, write_raw
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, IndexType
+
 from fusion_io import messages, topics
 from fusion_io.container import MessageFile
 from fusion_io.errors import LogError
 from fusion_io.reader import open_log
 from fusion_io.recovery import scan
 from fusion_io.writer import LogWriter
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from log_samples import SECOND, START, camera_info, depth, frames, imu_series, pair_estimates, raw_image, write_raw
-from mcap.opcode import Opcode
-from mcap.writer import CompressionType, IndexType
 
 PREFIX = 9  # bytes of opcode and length before a record
 COMPRESSIONS = [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE]

@@ -6,16 +6,17 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from fusion_io import messages
-from fusion_io.errors import LogError
-from fusion_io.messages import FrameTransform, ImuSample, PoseSample
-from fusion_io.records import CameraInfo, GnssFix, PairEstimate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from log_samples import START, WIDTH, depth, grey, header, pair_estimates, raw_image, serialise
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
+
+from fusion_io import messages
+from fusion_io.errors import LogError
+from fusion_io.messages import FrameTransform, ImuSample, PoseSample
+from fusion_io.records import CameraInfo, GnssFix, PairEstimate
 
 any_float = st.floats(width=64)  # NaN, infinities and signed zeros too
 stamps = st.integers(0, 2**31 * 10**9 - 1)

@@ -8,11 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fusion_io import topics
-from fusion_io.errors import LogError
-from fusion_io.reader import open_log
-from fusion_io.records import GnssFix
-from fusion_io.writer import WAITING_IMAGES, LogWriter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_samples import (
@@ -30,6 +25,12 @@ from log_samples import (
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from scipy.spatial.transform import Rotation
+
+from fusion_io import topics
+from fusion_io.errors import LogError
+from fusion_io.reader import open_log
+from fusion_io.records import GnssFix
+from fusion_io.writer import WAITING_IMAGES, LogWriter
 
 
 def written(path: Path) -> list[tuple[str, int]]:
