@@ -98,27 +98,30 @@ class EkfConfig(Section):
     The noise of the IMU is that of consumer devices, widened by what the filter leaves out. gyro_noise
     (rad/s/sqrt(Hz)): also errors of mounting and time. accelerometer_noise (m/s^2/sqrt(Hz)): also the unknown lever
     arm to the camera. *_bias_walk (rad/s^2, m/s^3, per sqrt(Hz)): how biases wander; *_bias_sigma (rad/s, m/s^2): how
-    far they are from zero at first. gravity_sigma (rad): its direction at first, which accelerations hide.
-    velocity_sigma (m/s): at first, when nothing is known of it.
+    far they are from zero at first, the gyro's once the calibration has removed what it could see. gravity_sigma (rad):
+    of its direction at first, which accelerations hide. velocity_sigma (m/s): at first, when nothing is known of it.
 
-    angular_acceleration (rad/s^2) and acceleration (m/s^2): how far a motion strays from a constant velocity where no
-    IMU measures it. gate_probability: how seldom noise alone rejects a pair estimate; after max_rejected_in_a_row the
-    prediction is taken to be wrong instead, and the pairs alone are believed until both agree again.
+    Errors of a front end are correlated in time: beside the covariance of each pair estimate, it has a rate bias
+    (pair_rate_bias_sigma, rad/s) and a scale error (pair_scale_sigma) that change over pair_correlation_s.
+
+    angular_acceleration (rad/s^2/sqrt(Hz)) and acceleration (m/s^2/sqrt(Hz)): how the motion strays from a constant one
+    where no IMU measures it. gate_probability: how seldom noise alone rejects a pair estimate; after
+    max_rejected_in_a_row the prediction is taken to be wrong instead, and the pairs are believed until both agree.
     """
 
-    gyro_noise: PositiveFloat = 1e-3
-    accelerometer_noise: PositiveFloat = 0.1
+    gyro_noise: PositiveFloat = 5e-4
+    accelerometer_noise: PositiveFloat = 1.0
     gyro_bias_walk: PositiveFloat = 1e-5
     accelerometer_bias_walk: PositiveFloat = 1e-4
-    gyro_bias_sigma: PositiveFloat = 1e-2
-    accelerometer_bias_sigma: PositiveFloat = 0.2
+    gyro_bias_sigma: PositiveFloat = 2e-4
+    accelerometer_bias_sigma: PositiveFloat = 0.1
     gravity_sigma: PositiveFloat = 0.3
-    pair_rate_bias_sigma: PositiveFloat = 5e-4
+    velocity_sigma: PositiveFloat = 30.0
+    pair_rate_bias_sigma: PositiveFloat = 2e-3
     pair_scale_sigma: PositiveFloat = 0.02
     pair_correlation_s: PositiveFloat = 30.0
-    velocity_sigma: PositiveFloat = 30.0
-    angular_acceleration: PositiveFloat = 1.0
-    acceleration: PositiveFloat = 3.0
+    angular_acceleration: PositiveFloat = 0.5
+    acceleration: PositiveFloat = 2.0
     gate_probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
     max_rejected_in_a_row: Annotated[int, Field(ge=0)] = 4
 

@@ -4,7 +4,7 @@ The nominal state lives outside the filter, which estimates its error (filterpy)
 spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
 moved into the nominal state; then the present pose becomes the clone. Everything is causal.
 
-Error state (27): attitude, position, velocity, gyro bias, accelerometer bias, gravity direction (2), attitude and
+Error state (26): attitude, position, velocity, gyro bias, accelerometer bias, gravity direction (2), attitude and
 position of the clone. Attitudes err on the right, R = R_nominal Exp(error), all else adds. Gravity is the third column of
 a rotation, Q e3 times its magnitude, of which only two errors are felt. The world is the first camera's frame.
 
@@ -32,9 +32,9 @@ GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the acceler
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
-PAIR_RATE_BIAS, PAIR_SCALE = slice(17, 20), slice(20, 21)
-CLONE_ATTITUDE, CLONE_POSITION = slice(21, 24), slice(24, 27)
-DIMENSION = 27
+PAIR_RATE_BIAS = slice(17, 20)
+CLONE_ATTITUDE, CLONE_POSITION = slice(20, 23), slice(23, 26)
+DIMENSION = 26
 
 # The cross products with the three unit vectors.
 GENERATORS = np.array(
@@ -77,7 +77,6 @@ class State:
     accelerometer_bias: FloatArray
     Q: FloatArray
     pair_rate_bias: FloatArray
-    pair_scale: float
     R_clone: FloatArray
     p_clone: FloatArray
 
@@ -95,10 +94,9 @@ class State:
         return motion
 
     def measurement(self, dt: float) -> FloatArray:
-        """What a pair estimate over dt seconds shows of the motion (4, 4): turned by its bias, scaled by its error."""
+        """What a pair estimate over dt seconds shows of the motion (4, 4): it is turned by the bias of the pairs."""
         shown = self.motion
         shown[:3, :3] = shown[:3, :3] @ exp(self.pair_rate_bias * dt)
-        shown[:3, 3] *= 1.0 + self.pair_scale
         return shown
 
 
@@ -129,7 +127,7 @@ def right_jacobian(vectors: FloatArray) -> FloatArray:
 
 
 def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
-    """The state after M pieces of IMU, and the Jacobians (M, 27, 27) of its error from piece to piece.
+    """The state after M pieces of IMU, and the Jacobians (M, 26, 26) of its error from piece to piece.
 
     Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it.
     """
@@ -158,18 +156,16 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
 
 
 def measurement_jacobian(state: State, dt: float) -> FloatArray:
-    """H (6, 27): how what a pair estimate shows, perturbed on the right, changes with the error."""
-    motion, shown = state.motion, state.measurement(dt)
-    t, R_shown, turn = motion[:3, 3], shown[:3, :3], state.pair_rate_bias * dt
+    """H (6, 26): how what a pair estimate shows, perturbed on the right, changes with the error."""
+    turn = state.pair_rate_bias * dt
+    R_shown = state.measurement(dt)[:3, :3]
     H = np.zeros((6, DIMENSION))
     H[:3, ATTITUDE] = exp(-turn)
     H[:3, CLONE_ATTITUDE] = -R_shown.T
     H[:3, PAIR_RATE_BIAS] = right_jacobian(turn) * dt
-    scale = 1.0 + state.pair_scale
-    H[3:, POSITION] = scale * exp(-turn) @ state.R.T
+    H[3:, POSITION] = exp(-turn) @ state.R.T
     H[3:, CLONE_POSITION] = -H[3:, POSITION]
-    H[3:, CLONE_ATTITUDE] = scale * R_shown.T @ skew(t)
-    H[3:, PAIR_SCALE] = R_shown.T @ t[:, None]
+    H[3:, CLONE_ATTITUDE] = R_shown.T @ skew(state.motion[:3, 3])
     return H
 
 
@@ -180,7 +176,7 @@ def difference(measured: FloatArray, predicted: FloatArray) -> FloatArray:
 
 
 def inject(state: State, error: FloatArray) -> State:
-    """The state with an error (27,) moved into it."""
+    """The state with an error (26,) moved into it."""
     return State(
         R=state.R @ exp(error[ATTITUDE]),
         p=state.p + error[POSITION],
@@ -189,14 +185,13 @@ def inject(state: State, error: FloatArray) -> State:
         accelerometer_bias=state.accelerometer_bias + error[ACCELEROMETER_BIAS],
         Q=state.Q @ exp(np.append(error[GRAVITY_DIRECTION], 0.0)),
         pair_rate_bias=state.pair_rate_bias + error[PAIR_RATE_BIAS],
-        pair_scale=state.pair_scale + float(error[PAIR_SCALE][0]),
         R_clone=state.R_clone @ exp(error[CLONE_ATTITUDE]),
         p_clone=state.p_clone + error[CLONE_POSITION],
     )
 
 
 def reset_jacobian(error: FloatArray) -> FloatArray:
-    """(27, 27): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
+    """(26, 26): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
     G = np.eye(DIMENSION)
     G[ATTITUDE, ATTITUDE] = right_jacobian(error[ATTITUDE])
     G[CLONE_ATTITUDE, CLONE_ATTITUDE] = right_jacobian(error[CLONE_ATTITUDE])
@@ -210,7 +205,7 @@ class Filter:
     def __init__(self, config: EkfConfig) -> None:
         self.config = config
         eye, zero = np.eye(3), np.zeros(3)
-        self.state = State(eye, zero, zero, zero, zero, eye, zero, 0.0, eye, zero)
+        self.state = State(eye, zero, zero, zero, zero, eye, zero, eye, zero)
         self.rate = np.zeros(3)  # rad/s in the last step; a step without IMU is predicted to go on so
         self.knows_gravity = False
         self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
@@ -221,8 +216,9 @@ class Filter:
         sigma[ACCELEROMETER_BIAS] = config.accelerometer_bias_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
         sigma[PAIR_RATE_BIAS] = config.pair_rate_bias_sigma
-        sigma[PAIR_SCALE] = config.pair_scale_sigma
         self.kf.P = np.diag(sigma**2)
+        # Position errors in the world that the scale of the pairs causes (3), and its error (1): see the module.
+        self.by_scale = np.diag([0.0, 0.0, 0.0, config.pair_scale_sigma**2])
         density = np.zeros(DIMENSION)
         density[ATTITUDE] = config.gyro_noise
         density[GYRO_BIAS] = config.gyro_bias_walk
@@ -252,14 +248,12 @@ class Filter:
         self.kf.predict()
 
     def drift(self, dt: float) -> None:
-        """Let what is wrong with the pairs fade and wander: Gauss-Markov processes."""
-        config, state = self.config, self.state
-        keep = np.exp(-dt / config.pair_correlation_s)
-        self.state = replace(state, pair_rate_bias=keep * state.pair_rate_bias, pair_scale=keep * state.pair_scale)
+        """Let the rate bias of the pairs fade and wander: a Gauss-Markov process."""
+        keep = np.exp(-dt / self.config.pair_correlation_s)
+        self.state = replace(self.state, pair_rate_bias=keep * self.state.pair_rate_bias)
         factor, variance = np.ones(DIMENSION), np.zeros(DIMENSION)
-        factor[PAIR_RATE_BIAS] = factor[PAIR_SCALE] = keep
-        variance[PAIR_RATE_BIAS] = (1 - keep**2) * config.pair_rate_bias_sigma**2
-        variance[PAIR_SCALE] = (1 - keep**2) * config.pair_scale_sigma**2
+        factor[PAIR_RATE_BIAS] = keep
+        variance[PAIR_RATE_BIAS] = (1 - keep**2) * self.config.pair_rate_bias_sigma**2
         self.kf.F, self.kf.Q = np.diag(factor), np.diag(variance)
         self.kf.predict()
 
@@ -293,6 +287,11 @@ class Filter:
 
     def clone(self, dt: float) -> None:
         """Make the present pose, dt seconds after the clone, the next one; it errs as the present pose does."""
+        keep = np.exp(-dt / self.config.pair_correlation_s)
+        walk = np.diag([1.0, 1.0, 1.0, keep])
+        walk[:3, 3] = self.state.p - self.state.p_clone
+        self.by_scale = walk @ self.by_scale @ walk.T
+        self.by_scale[3, 3] += (1 - keep**2) * self.config.pair_scale_sigma**2
         self.rate = log(self.state.motion[:3, :3]) / dt
         self.state = replace(self.state, R_clone=self.state.R, p_clone=self.state.p)
         copy = np.eye(DIMENSION)
@@ -304,7 +303,9 @@ class Filter:
         """(6, 6) of the present pose, rotation first, right perturbation."""
         to_body = np.eye(6)
         to_body[3:, 3:] = self.state.R.T
-        return np.asarray(to_body @ self.kf.P[:6, :6] @ to_body.T)
+        P = self.kf.P[:6, :6].copy()
+        P[3:, 3:] += self.by_scale[:3, :3]
+        return np.asarray(to_body @ P @ to_body.T)
 
     def _look_down(self, window: ImuWindow) -> None:
         """Take gravity's direction from the first accelerations: an accelerometer at rest shows what holds it up."""
@@ -315,7 +316,7 @@ class Filter:
 
 
 def _velocity_walk(density: float, dt: float) -> FloatArray:
-    """Covariance (27, 27) of a white acceleration of this density (m/s^2/sqrt(Hz)) over dt seconds."""
+    """Covariance (26, 26) of a white acceleration of this density (m/s^2/sqrt(Hz)) over dt seconds."""
     Q = np.zeros((DIMENSION, DIMENSION))
     Q[POSITION, POSITION] = density**2 * dt**3 / 3 * np.eye(3)
     Q[POSITION, VELOCITY] = Q[VELOCITY, POSITION] = density**2 * dt**2 / 2 * np.eye(3)

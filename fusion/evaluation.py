@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform, Rotation, Slerp
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 
@@ -115,7 +115,7 @@ def common(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajectory, 
     compared = Trajectory(stamps, estimate.poses[spanned], covariances)
     if not len(stamps):
         return compared, Trajectory(stamps, compared.poses)
-    return compared.relative_to_first(), interpolate(ground_truth, stamps).relative_to_first()
+    return compared.relative_to_first(), Trajectory(stamps, ground_truth.at(stamps)).relative_to_first()
 
 
 def covers(trajectory: Trajectory, stamps_ns: IntArray) -> NDArray[np.bool_]:
@@ -129,16 +129,6 @@ def covers(trajectory: Trajectory, stamps_ns: IntArray) -> NDArray[np.bool_]:
     near = known[after] - known[after - 1] <= MAX_GROUND_TRUTH_GAP_S * NANOSECONDS
     covered: NDArray[np.bool_] = inside & (exact | near)
     return covered
-
-
-def interpolate(trajectory: Trajectory, stamps_ns: IntArray) -> Trajectory:
-    """The trajectory at stamps (N,) within its own, linear in position, slerp in rotation, without covariances."""
-    seconds = (trajectory.stamps_ns - trajectory.stamps_ns[0]) / NANOSECONDS
-    queries = (stamps_ns - trajectory.stamps_ns[0]) / NANOSECONDS
-    positions = trajectory.poses.translation
-    translation = np.stack([np.interp(queries, seconds, positions[:, axis]) for axis in range(3)], axis=1)
-    rotation = Slerp(seconds, trajectory.poses.rotation)(queries)
-    return Trajectory(stamps_ns, RigidTransform.from_components(translation, rotation))
 
 
 def kitti_errors(

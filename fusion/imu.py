@@ -24,6 +24,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import binary_closing, binary_opening, find_objects, label
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import f as f_distribution
 
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate
 
@@ -50,6 +51,12 @@ CONTRADICTION = 8.0  # standard deviations
 CONTRADICTION_PAIRS = 4  # at least so many in a row
 CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
 
+# A constant difference of gyro and pairs is the gyro's bias where chance and the drift of the pairs cannot explain it;
+# else the gyro is taken for one whose bias has been removed already, which is worth more than the pairs.
+BATCHES = 5  # whose scatter shows how uncertain the mean of errors is that are correlated in time
+PAIR_DRIFT = 3e-4  # rad/s: constant over a log, so that no scatter shows it
+CHANCE = 0.02
+
 # An IMU has a hole where samples are further apart than this many of its periods.
 HOLE_PERIODS = 5.0
 
@@ -72,9 +79,9 @@ class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
 
     rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
-    gyro_bias (3,) rad/s in IMU axes, as the pairs see it. used, reason: the verdict and what led to it.
-    rotation_std_rad (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (3,): standard deviations, zero for
-    what was given. faulty_ns (M, 2): intervals on the IMU's clock in which the gyro contradicts the pairs for long.
+    gyro_bias (3,) rad/s in IMU axes; zero where the pairs cannot tell it from zero. used, reason: the verdict and what
+    led to it. rotation_std_rad (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (rad/s, any axis): standard
+    deviations, zero for what was given or is taken to be zero. faulty_ns (M, 2): intervals on the IMU's clock in which the gyro contradicts the pairs for long.
     """
 
     rotation_imu_camera: Rotation | None
@@ -84,7 +91,7 @@ class ImuCalibration:
     reason: str
     rotation_std_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
     time_offset_std_s: float = 0.0
-    gyro_bias_std: FloatArray = field(default_factory=lambda: np.zeros(3))
+    gyro_bias_std: float = 0.0
     faulty_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
@@ -116,21 +123,22 @@ def calibrate(
 
     fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
     problem = _fit_problem(fit)
+    gyro_bias, gyro_bias_std = _significant_bias(fit)
     return ImuCalibration(
         fit.rotation_imu_camera,
         fit.time_offset_s,
-        fit.gyro_bias,
+        gyro_bias,
         used=problem is None,
         reason=problem or _summary(fit),
         rotation_std_rad=fit.std[ROTATION],
         time_offset_std_s=float(fit.std[OFFSET][0]),
-        gyro_bias_std=fit.std[BIAS],
+        gyro_bias_std=gyro_bias_std,
         faulty_ns=fit.faulty_intervals() + imu.stamps_ns[0],
     )
 
 
 def in_camera_axes(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
-    """The IMU on the camera's clock and in the camera's axes, without faulty stretches. Its biases are not removed.
+    """The IMU on the camera's clock and in the camera's axes, without its gyro bias and faulty stretches.
 
     Raises ValueError where the mounting is unknown.
     """
@@ -142,7 +150,7 @@ def in_camera_axes(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
     to_camera = calibration.rotation_imu_camera.inv()
     return ImuSeries(
         imu.stamps_ns[good] - round(calibration.time_offset_s * NANOSECONDS),
-        to_camera.apply(imu.angular_velocity[good]),
+        to_camera.apply(imu.angular_velocity[good] - calibration.gyro_bias),
         to_camera.apply(imu.linear_acceleration[good]),
         imu.angular_velocity_std,
         imu.linear_acceleration_std,
@@ -347,6 +355,22 @@ def _refine(gyro: _Gyro, turns: _Turns, rotation: Rotation | None, offset_s: flo
         predicted=predicted,
         sigma=_robust_std(turned - predicted),
     )
+
+
+def _significant_bias(fit: _Fit) -> tuple[FloatArray, float]:
+    """The gyro's bias (3,) in IMU axes and its standard deviation, or zeros where it may as well be none.
+
+    The deviation of a mean of correlated errors follows from the scatter of the means of batches (Law and Carson,
+    "A sequential procedure for determining the length of a steady-state simulation", 1979).
+    """
+    weight = 1.0 / (1.0 + (fit.deviation / CAUCHY) ** 2)
+    errors = (fit.turns.turned - fit.predicted) / (fit.turns.target_s - fit.turns.source_s)[:, None]
+    batches = zip(np.array_split(errors, BATCHES), np.array_split(weight, BATCHES), strict=True)
+    means = [np.average(values, axis=0, weights=weights) for values, weights in batches]
+    variance = float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES + PAIR_DRIFT**2
+    if fit.gyro_bias @ fit.gyro_bias / (3 * variance) < f_distribution.isf(CHANCE, 3, 3 * (BATCHES - 1)):
+        return np.zeros(3), 0.0
+    return fit.gyro_bias, float(np.sqrt(variance))
 
 
 def _whitened(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:

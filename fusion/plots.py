@@ -17,7 +17,7 @@ from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 
 # Colours that the colour-blind can tell apart (Okabe and Ito 2008), and different dashes for print in grey.
 STYLES: dict[str, dict[str, Any]] = {
-    "raw": {"label": "raw", "color": "0.55", "linestyle": "--"},
+    "raw": {"label": "raw", "color": "0.55", "linestyle": "--", "zorder": 3},  # shows on top of an equal pose graph
     "posegraph": {"label": "pose graph", "color": "#0072B2", "linestyle": "-"},
     "ekf": {"label": "EKF", "color": "#D55E00", "linestyle": "-."},
 }

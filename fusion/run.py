@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from fusion.config import FrontendConfig, ImuConfig, RunConfig
+    from fusion.ekf import EkfResult
     from fusion.output import Outcome
+    from fusion.posegraph import PoseGraphResult
     from fusion_io.findings import Findings
     from fusion_io.reader import Log
     from fusion_io.records import ImuSeries, PairEstimate, Trajectory
@@ -98,10 +100,10 @@ def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: F
     if config.mode == "recorded" or (config.mode == "auto" and log.has_pairs):
         pairs = log.pairs()
         if not pairs:
-            raise LogError(f"{log.path}: no recorded pair estimates, and the front end is to use those")
+            raise LogError(f"{log.path}: no recorded pair estimates that can be used")
         return pairs
     if not log.has_frames:
-        raise LogError(f"{log.path}: neither pair estimates nor images with depth; it has {', '.join(log.roles)}")
+        raise LogError(f"{log.path}: no images to estimate pairs from; it has {', '.join(log.roles)}")
     from fusion_io.messages import decode_pair, encode_pair
     from fusion_io.progress import track
     from learned.estimator import estimate_pairs
@@ -113,7 +115,8 @@ def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: F
     for name, count in skipped.items():
         findings.put(name, count, f"{name.replace('_', ' ')}: {count}")
     if not pairs:
-        raise LogError(f"{log.path}: no pair of frames could be estimated, of {len(log.frame_stamps())} frames")
+        reasons = "; ".join(findings.notes) or f"it has {len(log.frame_stamps())} frames"
+        raise LogError(f"{log.path}: no pair of frames could be estimated ({reasons})")
     return pairs
 
 
@@ -135,24 +138,27 @@ def fuse(
     name: str, steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: RunConfig, findings: Findings
 ) -> tuple[Trajectory, str] | None:
     """The trajectory of a back end and its remark on it; None, and counted, where it fails: the others are not lost."""
-    from numpy.linalg import LinAlgError
+    import numpy as np
 
     try:
+        result: PoseGraphResult | EkfResult
         if name == "posegraph":
             from fusion import posegraph
 
-            graph = posegraph.solve(steps, inertial, config.posegraph)
-            rejected = graph.imu_rejected + graph.pairs_rejected
-            findings.put("posegraph_rejected", rejected, f"measurements rejected by the pose graph: {rejected}")
-            return graph.trajectory, graph.note
-        from fusion import ekf
+            result = posegraph.solve(steps, inertial, config.posegraph)
+            rejected = result.imu_rejected + result.pairs_rejected
+        else:
+            from fusion import ekf
 
-        filtered = ekf.solve(steps, inertial, config.ekf)
-        findings.put("ekf_rejected", filtered.rejected, f"measurements rejected by the EKF: {filtered.rejected}")
-        return filtered.trajectory, filtered.note
-    except (FusionError, LinAlgError, RuntimeError) as error:  # GTSAM's solvers raise RuntimeError
+            result = ekf.solve(steps, inertial, config.ekf)
+            rejected = result.rejected
+        if not np.all(np.isfinite(result.trajectory.poses.as_matrix())):
+            raise FloatingPointError("a pose is not finite")
+    except (FusionError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:  # GTSAM raises RuntimeError
         findings.put(f"{name}_failed", 1, f"back end failed ({name}): {' '.join(str(error).split())}")
         return None
+    findings.put(f"{name}_rejected", rejected, f"measurements rejected as outliers ({name}): {rejected}")
+    return result.trajectory, result.note
 
 
 def report(folder: Path, outcome: Outcome) -> None:
@@ -188,7 +194,7 @@ def default_folder(log_path: Path) -> Path:
 
 
 class Stopwatch:
-    """Seconds by stage: each lap ends the stage that began with the lap before."""
+    """Seconds by stage: each lap ends the stage that began with the lap before, and says so where somebody watches."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -199,6 +205,8 @@ class Stopwatch:
         now = perf_counter()
         self.seconds[stage] = now - self._last
         self._last = now
+        if sys.stderr.isatty():
+            print(f"{stage}: {self.seconds[stage]:.1f} s", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:

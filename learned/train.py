@@ -31,7 +31,7 @@ class Recipe:
     its decay interval and lambda are not given there: gamma 0.5 every 20,000 steps and 1e-5 are our choice.
     """
 
-    steps: int = 4500
+    steps: int = 4000
     batch: int = 16
     learning_rate: float = 1e-3
     schedule: str = "cosine"
@@ -42,7 +42,7 @@ class Recipe:
     validation_share: float = 0.05
     validate_every: int = 250
     imu_dropout: float = 0.1
-    calibration_clips: int = 64
+    calibration_clips: int = 128
 
 
 RECIPES = {

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.evaluation import Metrics, errors_over_time, evaluate, interpolate, kitti_errors
+from fusion.evaluation import Metrics, errors_over_time, evaluate, kitti_errors
 from fusion_io.records import NANOSECONDS, FloatArray, Trajectory
 
 PERIOD_NS = NANOSECONDS // 10
@@ -134,7 +134,7 @@ def test_ground_truth_is_interpolated_linearly_in_position_and_by_slerp_in_rotat
         [[0.0, 0.0, 0.0], [1.0, 2.0, 4.0]], Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.0, 0.8, 0.0]])
     )
     known = Trajectory(np.array([0, PERIOD_NS]), ends)
-    found = interpolate(known, np.array([0, PERIOD_NS // 4, PERIOD_NS])).poses
+    found = known.at(np.array([0, PERIOD_NS // 4, PERIOD_NS]))
     assert_allclose(found.translation, [[0, 0, 0], [0.25, 0.5, 1.0], [1.0, 2.0, 4.0]], atol=1e-12)
     assert_allclose(found.rotation.as_rotvec(), [[0, 0, 0], [0, 0.2, 0], [0, 0.8, 0]], atol=1e-12)
 

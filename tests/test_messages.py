@@ -1,5 +1,6 @@
 """Records and ROS 2 messages say the same, to the last bit."""
 
+import contextlib
 import dataclasses
 import struct
 
@@ -58,7 +59,7 @@ def any_pair(draw: st.DrawFn) -> PairEstimate:
     )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(any_pair())
 def test_pair_estimates_round_trip_to_the_bit(pair: PairEstimate) -> None:
     data = messages.encode_pair(pair)
@@ -67,7 +68,7 @@ def test_pair_estimates_round_trip_to_the_bit(pair: PairEstimate) -> None:
     assert messages.header_stamp(data) == pair.target_stamp_ns
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(stamps, vectors(3), vectors(3), st.one_of(st.none(), st.floats(1e-12, 1e12)), st.booleans())
 def test_imu_samples_round_trip_to_the_bit(stamp, gyro, accelerometer, deviation, measured) -> None:
     sample = ImuSample(gyro, accelerometer, deviation, 0.25 if measured else None, has_linear_acceleration=measured)
@@ -77,7 +78,7 @@ def test_imu_samples_round_trip_to_the_bit(stamp, gyro, accelerometer, deviation
     assert messages.header_stamp(data) == stamp
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(stamps, vectors(3), vectors(4))
 def test_poses_round_trip_to_the_bit(stamp, position, quat_wxyz) -> None:
     pose = PoseSample(position, quat_wxyz)
@@ -154,7 +155,7 @@ def test_images_round_trip(shape: tuple[int, ...]) -> None:
     np.testing.assert_array_equal(read, image)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(arrays(np.float32, (2, 3), elements=st.floats(width=32)))
 def test_depth_is_rounded_to_a_256th_of_a_metre_and_invalid_is_zero(values) -> None:
     values = np.where(values > 30_000, np.inf, values).astype(np.float32)  # beyond that float32 itself is coarser
@@ -244,7 +245,7 @@ def test_an_unknown_encoding_is_named() -> None:
         messages.decode_image(kind, data)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.binary(max_size=200), st.sampled_from([0, 1]))
 def test_garbage_is_a_value_error(body: bytes, byte_order: int) -> None:
     data = bytes([0, byte_order, 0, 0]) + body
@@ -261,10 +262,8 @@ def test_garbage_is_a_value_error(body: bytes, byte_order: int) -> None:
         lambda: messages.decode_transforms(data),
     ]
     for decode in decoders:
-        try:
+        with contextlib.suppress(ValueError):
             decode()
-        except ValueError:
-            pass
 
 
 def test_intrinsics_of_a_region_of_interest_and_of_a_rectified_image() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 from array import array
@@ -38,6 +39,7 @@ _OTHER_CLOCK_S = 60.0
 _TRIED_MESSAGES = 10
 _LISTED_TOPICS = 8
 _UNIT_TOLERANCE = 0.01
+_ASYMMETRY = 1e-6
 
 _T = TypeVar("_T")
 
@@ -180,27 +182,27 @@ class Log:
         return depths, depth_of
 
     def _camera_info(self, file: MessageFile, infos: MessageIndex, i: int) -> CameraInfo:
-        try:
-            # ROS names rectified images image_rect*; their intrinsics are in P, and the lens is already undone.
-            return messages.decode_camera_info(
-                file.read(infos, i), rectified="image_rect" in self.roles.get("image", "")
-            )
-        except ValueError as error:
-            raise LogError(f"{self.path}: {self.roles['camera_info']}: {error}") from error
+        # ROS names rectified images image_rect*; their intrinsics are in P, and the lens is already undone.
+        rectified = "image_rect" in self.roles.get("image", "")
+        with self._refusing("camera_info", infos.stamps_ns[i]):
+            return messages.decode_camera_info(file.read(infos, i), rectified)
 
     def _frame(self, raw: CameraFrame) -> CameraFrame:
         """What was recorded, brought to the size of the image and undistorted."""
         height, width = raw.image.shape[:2]
-        at = f"at {_seconds(raw.stamp_ns)}"
-        try:
-            topic = self.roles["camera_info"]
-            info = camera.fit_camera(raw.camera, width, height)
-            topic = self.roles.get("depth", "")
+        with self._refusing("depth", raw.stamp_ns):
             depth = None if raw.depth is None else camera.fit_depth(raw.depth, width, height)
-            topic = self.roles["camera_info"]
+        with self._refusing("camera_info", raw.stamp_ns):
+            info = camera.fit_camera(raw.camera, width, height)
             return camera.undistorted(CameraFrame(raw.stamp_ns, raw.image, depth, info))
+
+    @contextlib.contextmanager
+    def _refusing(self, role: str, stamp_ns: int) -> Iterator[None]:
+        """Turn what cannot be right into an error that names file, topic and time."""
+        try:
+            yield
         except ValueError as error:
-            raise LogError(f"{self.path}: {topic} {at}: {error} ({self.roles['image']})") from error
+            raise LogError(f"{self._named(role)} at {_seconds(stamp_ns)}: {error}") from error
 
     # --- Series ---------------------------------------------------------------------------------
 
@@ -210,11 +212,11 @@ class Log:
         Samples that are not finite, and those that go back in time or repeat a stamp, are left out and counted.
         """
         if "imu" in self.roles:
-            return self._inertial("imu", gyro=True, accelerometer=True)
+            return self._inertial("imu", slice(0, 6))
         if "gyro" not in self.roles or "accelerometer" not in self.roles:
             return ImuSeries(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-        gyro = self._inertial("gyro", gyro=True, accelerometer=False)
-        accelerometer = self._inertial("accelerometer", gyro=False, accelerometer=True)
+        gyro = self._inertial("gyro", slice(0, 3))
+        accelerometer = self._inertial("accelerometer", slice(3, 6))
         acceleration, supported = inertial.interpolate(
             accelerometer.stamps_ns, accelerometer.linear_acceleration, gyro.stamps_ns
         )
@@ -228,8 +230,8 @@ class Log:
             accelerometer.linear_acceleration_std,
         )
 
-    def _inertial(self, role: str, gyro: bool, accelerometer: bool) -> ImuSeries:
-        """One topic of Imu messages, of which these halves are needed."""
+    def _inertial(self, role: str, needed: slice) -> ImuSeries:
+        """One topic of Imu messages, of whose angular velocity and linear acceleration these numbers are needed."""
         recorded, columns = array("q"), array("d")
         for stamp, sample in self._decoded(role, messages.decode_imu):
             recorded.append(stamp)
@@ -238,8 +240,7 @@ class Log:
             columns.append(sample.angular_velocity_std or np.nan)
             columns.append(sample.linear_acceleration_std or np.nan)
         stamps, samples = np.array(recorded, dtype=np.int64), np.array(columns).reshape(-1, 8)
-        needed = samples[:, 0 if gyro else 3 : 6 if accelerometer else 3]
-        finite = np.all(np.isfinite(needed), axis=1)
+        finite = np.all(np.isfinite(samples[:, needed]), axis=1)
         self._report(f"{role}_nan", role, stamps[~finite], "without finite values are left out")
         stamps, samples = self._increasing(role, stamps[finite], samples[finite])
         return ImuSeries(stamps, samples[:, 0:3], samples[:, 3:6], _typical(samples[:, 6]), _typical(samples[:, 7]))
@@ -353,28 +354,35 @@ class Log:
         """The frame of the first of these roles that the log has and that names one."""
         for role in among:
             if role in self.roles:
-                with self._open() as file:
-                    name = messages.frame_id(self._type(role), file.read(self._index(role), 0))
+                topic = self.roles[role]
+                name, _ = self._first(topic, functools.partial(messages.frame_id, self._types[topic]))
                 if name:
                     return name
         return ""
 
+    def _first(self, topic: str, read: Callable[[memoryview], str]) -> tuple[str, str]:
+        """What the first message says that can be read, and otherwise "" and why not."""
+        index, reason = self._contents.index[topic], ""
+        with self._open() as file:
+            for i in range(min(len(index), _TRIED_MESSAGES)):
+                try:
+                    return read(file.read(index, i)), ""
+                except ValueError as error:
+                    reason = str(error)
+        return "", reason
+
     # --- Topics and time ------------------------------------------------------------------------
 
     def _topics(self) -> list[Topic]:
-        with self._open() as file:
-            return [Topic(topic, self._types[topic], self._kind(file, topic)) for topic in self._contents.index]
-
-    def _kind(self, file: MessageFile, topic: str) -> str:
-        """The role that a topic's messages fit, judged by the first that can be read."""
-        index = self._contents.index[topic]
-        for i in range(min(len(index), _TRIED_MESSAGES)):
-            try:
-                return roles.kind_of(topic, self._types[topic], file.read(index, i))
-            except ValueError as error:
-                reason = str(error)
-        self._findings.remark(f"{self.path}: {topic}: {reason}")
-        return ""
+        """The topics that can be read, each with the role that it fits, judged by its first message."""
+        found = []
+        for topic in self._contents.index:
+            message_type = self._types[topic]
+            kind, reason = self._first(topic, functools.partial(roles.kind_of, topic, message_type))
+            found.append(Topic(topic, message_type, kind))
+            if reason:
+                self._findings.remark(f"{self.path}: {topic}: {reason}")
+        return found
 
     def _time_range(self) -> tuple[int, int]:
         spans = [
@@ -479,6 +487,6 @@ def _is_valid(pair: PairEstimate) -> bool:
         and all(bool(np.all(np.isfinite(values))) for values in numbers)
         and bool(_is_unit(pair.quat_wxyz))
         and -1 <= pair.winner < max(hypotheses, 1)
-        and bool(np.allclose(pair.covariance, pair.covariance.T, rtol=1e-6, atol=0))
-        and bool(np.all(np.linalg.eigvalsh(pair.covariance) > 0))
+        and bool(np.abs(pair.covariance - pair.covariance.T).max() <= _ASYMMETRY * np.abs(pair.covariance).max())
+        and bool(np.linalg.eigvalsh(pair.covariance)[0] > 0)
     )

@@ -259,6 +259,8 @@ class _Scan:
         self._chunked = True
         end = block.offset + block.length
         cut = end > self._size
+        if cut:
+            block = block._replace(length=self._size - block.offset)
         self._after_bad_chunk = False
         try:
             contents = self._unpacked(block)
@@ -336,7 +338,7 @@ class _Scan:
         number, last_end = len(self._blocks), 0
         self._blocks.append(block)
         for opcode, position, start, end in split_records(contents):
-            if opcode == Opcode.MESSAGE:
+            if opcode == Opcode.MESSAGE and end - start >= MESSAGE.size:
                 self._add_message(contents, number, position, start, end)
             elif opcode in _DEFINITIONS:
                 self._read_definition(opcode, contents[start:end])

@@ -83,6 +83,12 @@ def simulated_drive() -> Callable[..., Drive]:
     return make
 
 
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process draw nothing, which takes most of a small run's time; the pictures have their own tests."""
+    monkeypatch.setattr("fusion.output.write_plots", lambda folder, outcome: None)
+
+
 @pytest.fixture(scope="session")
 def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network of the right shape that has learned nothing: for what must happen whatever it estimates."""

@@ -16,6 +16,8 @@ from fusion import run
 from fusion_io.reader import open_log
 from fusion_io.writer import LogWriter
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 Outcome = tuple[int, list[str], dict[str, Any] | None]
 
 
@@ -161,7 +163,7 @@ def test_frames_without_any_depth_leave_nothing_to_compute(
 ) -> None:
     drive.frames = [replace(frame, depth=None) for frame in drive.frames]
     log = drive.write(tmp_path / "log.mcap", leave_out=["pairs"])
-    _assert_refused(outcome(log, "--weights", str(small_weights)), 1, "log.mcap", "depth")
+    _assert_refused(outcome(log, "--weights", str(small_weights)), 1, "log.mcap", "pairs without depth: 59")
 
 
 def test_an_empty_file_is_refused(tmp_path: Path, outcome: Callable[..., Outcome]) -> None:
@@ -177,7 +179,7 @@ def test_a_log_without_messages_is_refused(tmp_path: Path, outcome: Callable[...
 
 def test_an_imu_alone_is_not_enough(tmp_path: Path, drive: Any, outcome: Callable[..., Outcome]) -> None:
     log = drive.write(tmp_path / "log.mcap", leave_out=["frames", "pairs"])
-    _assert_refused(outcome(log), 1, "log.mcap", "neither pair estimates nor images")
+    _assert_refused(outcome(log), 1, "log.mcap", "no images to estimate pairs from")
 
 
 def test_a_text_file_is_refused(tmp_path: Path, outcome: Callable[..., Outcome]) -> None:
