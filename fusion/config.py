@@ -123,7 +123,7 @@ class EkfConfig(Section):
     angular_acceleration: PositiveFloat = 0.5
     acceleration: PositiveFloat = 2.0
     gate_probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
-    max_rejected_in_a_row: Annotated[int, Field(ge=0)] = 4
+    max_rejected_in_a_row: Annotated[int, Field(ge=0)] = 5
 
 
 class RunConfig(Section):

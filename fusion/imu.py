@@ -25,13 +25,14 @@ from scipy.ndimage import binary_closing, binary_opening, find_objects, label
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import f as f_distribution
+from scipy.stats import rankdata
 
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate
 
-# The search for the time offset, and how well angular rates must correlate where it is right.
+# The search for the time offset, and how well angular rates must correlate (by rank) where it is right.
 MAX_TIME_OFFSET_S = 0.5
 TIME_OFFSET_STEP_S = 0.005
-MIN_CORRELATION = 0.5
+MIN_CORRELATION = 0.4
 
 # What a log must show before its IMU is used.
 MIN_PAIRS = 40  # that the IMU measured from start to end
@@ -39,7 +40,7 @@ MIN_COVERAGE = 0.5  # their share of all pairs
 MIN_EXPLAINED = 0.5  # share of the pairs' turning (as variance) that the gyro explains
 MIN_EXPLAINED_GIVEN = -0.1  # the same with a given mounting: on a straight road there is nothing to explain
 MIN_EXPLAINED_AXIS = -0.5  # about each axis; an axis that the gyro has reversed is at -3
-MAX_SCALE_ERROR = 0.02  # of the gyro against the pairs
+MAX_SCALE_ERROR = 0.01  # of the gyro against the pairs
 MAX_ROTATION_STD_RAD = float(np.deg2rad(2.0))
 MAX_TIME_OFFSET_STD_S = 0.02
 GRAVITY_RANGE = (8.8, 10.8)  # m/s^2, for the median magnitude that the accelerometer shows
@@ -48,7 +49,7 @@ MAX_FAULTY_SHARE = 0.2
 # Where gyro and pairs disagree for long, the gyro is at fault: front ends fail for single pairs, but an IMU that
 # stalled, saturated, or was filled in by interpolation did so for a while.
 CONTRADICTION = 8.0  # standard deviations
-CONTRADICTION_PAIRS = 4  # at least so many in a row
+CONTRADICTION_PAIRS = 6  # at least so many in a row
 CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
 
 # A constant difference of gyro and pairs is the gyro's bias where chance and the drift of the pairs cannot explain it;
@@ -66,6 +67,7 @@ GYRO_BIAS_PRIOR = 0.1  # rad/s
 TIME_OFFSET_PRIOR_S = 0.1
 
 WHITENING_ORDER = 5
+CLIP = 4.0  # standard deviations
 CAUCHY = 2.385  # standard deviations; 95 % efficient on Gaussian errors (Holland and Welsch, 1977)
 MAD_TO_STD = 1.4826
 ITERATIONS = 30
@@ -289,7 +291,10 @@ class _Fit:
 
 
 def _correlate(gyro: _Gyro, turns: _Turns) -> tuple[float, float]:
-    """The time offset at which the magnitudes of the angular rates correlate best, and that correlation."""
+    """The time offset at which the magnitudes of the angular rates correlate best, and that correlation.
+
+    It is Spearman's, of ranks: a few wild pairs would rule any other.
+    """
     offset_s, highest = 0.0, 0.0
     speed = np.linalg.norm(turns.turned, axis=1) / (turns.target_s - turns.source_s)
     for candidate_s in np.arange(-MAX_TIME_OFFSET_S, MAX_TIME_OFFSET_S + TIME_OFFSET_STEP_S / 2, TIME_OFFSET_STEP_S):
@@ -297,9 +302,9 @@ def _correlate(gyro: _Gyro, turns: _Turns) -> tuple[float, float]:
         covered = gyro.measured(start_s, end_s)
         if covered.sum() < MIN_PAIRS:
             continue
-        speeds = np.stack([speed[covered], gyro.speed(start_s[covered], end_s[covered])])
-        if np.all(np.ptp(speeds, axis=1) > 0.0):
-            correlation = float(np.corrcoef(speeds)[0, 1])
+        ranks = rankdata([speed[covered], gyro.speed(start_s[covered], end_s[covered])], axis=1)
+        if np.all(np.ptp(ranks, axis=1) > 0.0):
+            correlation = float(np.corrcoef(ranks)[0, 1])
             if correlation > highest:
                 offset_s, highest = float(candidate_s), correlation
     return offset_s, highest
@@ -374,22 +379,25 @@ def _significant_bias(fit: _Fit) -> tuple[FloatArray, float]:
 
 
 def _whitened(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residual (N, 3) and Jacobian (N, 3, M) filtered so that the residual is white with unit variance, per axis."""
+    """Residual (N, 3) and Jacobian (N, 3, M) filtered so that the residual is white with unit variance, per axis.
+
+    Outliers are clipped before, or the filter would spread them over their neighbours.
+    """
+    bound = CLIP * _robust_std(residual)
+    clipped = np.clip(residual, -bound, bound)
     white, white_jacobian = np.empty_like(residual), np.empty_like(jacobian)
     for axis in range(3):
-        taps = _autoregression(residual[:, axis])
-        white[:, axis] = lfilter(taps, 1.0, residual[:, axis])
+        taps = _autoregression(clipped[:, axis])
+        white[:, axis] = lfilter(taps, 1.0, clipped[:, axis])
         white_jacobian[:, axis] = lfilter(taps, 1.0, jacobian[:, axis], axis=0)
     sigma = _robust_std(white)
     return white / sigma, white_jacobian / sigma[:, None]
 
 
 def _autoregression(errors: FloatArray) -> FloatArray:
-    """The whitening filter (1, -a1, ..., -ap) of the errors (N,), fitted by least squares with outliers clipped."""
-    bound = 3.0 * _robust_std(errors)
-    clipped = np.clip(errors, -bound, bound)
-    past = np.lib.stride_tricks.sliding_window_view(clipped, WHITENING_ORDER)[:-1, ::-1]
-    coefficients, *_ = np.linalg.lstsq(past, clipped[WHITENING_ORDER:])
+    """The whitening filter (1, -a1, ..., -ap) of the errors (N,), by least squares."""
+    past = np.lib.stride_tricks.sliding_window_view(errors, WHITENING_ORDER)[:-1, ::-1]
+    coefficients, *_ = np.linalg.lstsq(past, errors[WHITENING_ORDER:])
     return np.concatenate([[1.0], -coefficients])
 
 

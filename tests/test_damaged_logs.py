@@ -316,6 +316,20 @@ def test_both_lengths_of_a_chunk_broken_cost_that_chunk(finished: bool, sample: 
     assert len(list(log.frames())) > 30
 
 
+def test_the_last_chunk_and_the_summary_behind_it_may_both_be_broken(sample: Path, tmp_path: Path) -> None:
+    """Reading stops there: it neither fails nor tries the same place for ever."""
+
+    def break_both(data: bytearray) -> None:
+        last = chunk_starts(data)[-1]
+        data[last + 37] ^= 0x40  # the length of the name of its compression
+        summary_start = int.from_bytes(data[-28:-20], "little")
+        data[summary_start] = 0
+
+    log = open_log(damage(sample, tmp_path, break_both))
+    assert log.warnings == {"bad_chunks": 1, "truncated": 1}
+    assert len(list(log.frames())) > 34
+
+
 def test_a_damaged_summary_is_not_needed(sample: Path, tmp_path: Path) -> None:
     def flip(data: bytearray) -> None:
         data[-100] ^= 0xFF

@@ -166,7 +166,7 @@ class _Scan:
                     return
                 name = "bad_chunks" if isinstance(broken, _BrokenChunkError) else "bad_records"
                 self._note(name, f"the record at byte {position} is damaged ({broken}): read on from byte {following}")
-                position = following
+                previous = position = following
 
     def _read_record(self, position: int) -> int:
         """Read what begins at this byte; returns where it ends."""
