@@ -4,9 +4,14 @@ The nominal state lives outside the filter, which estimates its error (filterpy)
 spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
 moved into the nominal state; then the present pose becomes the clone. Everything is causal.
 
-Error state (26): attitude, position, velocity, gyro bias, accelerometer bias, gravity direction (2), attitude and
-position of the clone. Attitudes err on the right, R = R_nominal Exp(error), all else adds. Gravity is the third column of
-a rotation, Q e3 times its magnitude, of which only two errors are felt. The world is the first camera's frame.
+Error state (26): attitude, position, velocity, gyro bias, accelerometer bias, direction of gravity (2), rate bias of
+the pairs, attitude and position of the clone. Attitudes err on the right, R = R_nominal Exp(error); all else adds.
+Gravity is Q e3 times its magnitude, so that only two errors of the rotation Q are felt. The world is the first camera's
+frame.
+
+The front end's errors are correlated in time. Its rate bias is a state while an IMU measures, for gyro and gravity can
+tell it. Its scale error is not: accelerations tell too little of it, and what they tell would throw the position about.
+What it does to the position is carried along beside the filter and added to the covariance.
 
 Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (error state, reset); Roumeliotis and Burdick,
 "Stochastic cloning", 2002.
@@ -17,9 +22,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
@@ -49,9 +56,9 @@ TILT = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
 class EkfResult:
     """The filtered trajectory and how the filter fared.
 
-    note: one line on what predicted the motion. rejected: pair estimates that the gate refused. nis (N,): normalised
-    innovation squared of each step, 6 on average where all is modelled right, NaN where there was no measurement.
-    gyro_bias (3,) rad/s, accelerometer_bias (3,) m/s^2: at the end, camera axes; gravity (3,) m/s^2 in the world.
+    rejected: pair estimates that the gate refused. nis (N,): normalised innovation squared of each step, 6 on average
+    where all is modelled right. note: one line on what predicted the motion. gyro_bias
+    (3,) rad/s and accelerometer_bias (3,) m/s^2 at the end, in camera axes; gravity (3,) m/s^2 in the world.
     """
 
     trajectory: Trajectory
@@ -63,11 +70,20 @@ class EkfResult:
     gravity: FloatArray
 
 
+class Measurement(NamedTuple):
+    """A pair estimate: motion (4, 4), T_source_target, its covariance (6, 6), and the time it took in seconds."""
+
+    motion: FloatArray
+    covariance: FloatArray
+    seconds: float
+
+
 @dataclass(frozen=True, slots=True)
 class State:
-    """The nominal state: pose and velocity in the world, biases in camera axes, gravity = Q e3 GRAVITY, the clone.
+    """The nominal state.
 
-    Rotations are matrices (3, 3). rate (3,) rad/s is that of the last step, by which a step without IMU is predicted.
+    R (3, 3), p, v (3,): pose and velocity in the world; gyro_bias (rad/s), accelerometer_bias (m/s^2), pair_rate_bias
+    (rad/s) (3,) in camera axes; Q (3, 3), whose third column points down; R_clone, p_clone: the pose of the last frame.
     """
 
     R: FloatArray
@@ -93,10 +109,10 @@ class State:
         motion[:3, 3] = self.R_clone.T @ (self.p - self.p_clone)
         return motion
 
-    def measurement(self, dt: float) -> FloatArray:
-        """What a pair estimate over dt seconds shows of the motion (4, 4): it is turned by the bias of the pairs."""
+    def shown(self, seconds: float) -> FloatArray:
+        """What a pair estimate over that time shows of the motion (4, 4): it turns by the rate bias too much."""
         shown = self.motion
-        shown[:3, :3] = shown[:3, :3] @ exp(self.pair_rate_bias * dt)
+        shown[:3, :3] = shown[:3, :3] @ exp(self.pair_rate_bias * seconds)
         return shown
 
 
@@ -155,14 +171,14 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
     return replace(state, R=R[-1], p=p, v=v[-1]), F
 
 
-def measurement_jacobian(state: State, dt: float) -> FloatArray:
-    """H (6, 26): how what a pair estimate shows, perturbed on the right, changes with the error."""
-    turn = state.pair_rate_bias * dt
-    R_shown = state.measurement(dt)[:3, :3]
+def shown_jacobian(state: State, seconds: float) -> FloatArray:
+    """H (6, 26): how what a pair estimate over that time shows changes with the error, as a right perturbation."""
+    turn = state.pair_rate_bias * seconds
+    R_shown = state.shown(seconds)[:3, :3]
     H = np.zeros((6, DIMENSION))
     H[:3, ATTITUDE] = exp(-turn)
     H[:3, CLONE_ATTITUDE] = -R_shown.T
-    H[:3, PAIR_RATE_BIAS] = right_jacobian(turn) * dt
+    H[:3, PAIR_RATE_BIAS] = right_jacobian(turn) * seconds
     H[3:, POSITION] = exp(-turn) @ state.R.T
     H[3:, CLONE_POSITION] = -H[3:, POSITION]
     H[3:, CLONE_ATTITUDE] = R_shown.T @ skew(state.motion[:3, 3])
@@ -202,167 +218,187 @@ def reset_jacobian(error: FloatArray) -> FloatArray:
 class Filter:
     """The nominal state, and the covariance of its error in filterpy's filter, through prediction and update."""
 
-    def __init__(self, config: EkfConfig) -> None:
+    def __init__(self, config: EkfConfig, gyro_bias_std: float = 0.0) -> None:
         self.config = config
         eye, zero = np.eye(3), np.zeros(3)
         self.state = State(eye, zero, zero, zero, zero, eye, zero, eye, zero)
-        self.rate = np.zeros(3)  # rad/s in the last step; a step without IMU is predicted to go on so
+        self.rate = zero  # rad/s in the last step, by which a step without an IMU is predicted to go on
         self.knows_gravity = False
-        self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
-        self.kf.x = np.zeros(DIMENSION)
-        sigma = np.zeros(DIMENSION)  # the first pose is the world itself, and its clone
+        sigma = np.zeros(DIMENSION)  # the first pose is the world itself, and so is its clone
         sigma[VELOCITY] = config.velocity_sigma
-        sigma[GYRO_BIAS] = config.gyro_bias_sigma
+        sigma[GYRO_BIAS] = np.hypot(config.gyro_bias_sigma, gyro_bias_std)
         sigma[ACCELEROMETER_BIAS] = config.accelerometer_bias_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
         sigma[PAIR_RATE_BIAS] = config.pair_rate_bias_sigma
+        self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
+        self.kf.x = np.zeros(DIMENSION)
         self.kf.P = np.diag(sigma**2)
-        # Position errors in the world that the scale of the pairs causes (3), and its error (1): see the module.
+        # Covariance of the position error that the pairs' scale has caused (3), and of the scale error itself (1).
         self.by_scale = np.diag([0.0, 0.0, 0.0, config.pair_scale_sigma**2])
-        density = np.zeros(DIMENSION)
-        density[ATTITUDE] = config.gyro_noise
-        density[GYRO_BIAS] = config.gyro_bias_walk
-        density[ACCELEROMETER_BIAS] = config.accelerometer_bias_walk
-        self.imu_walk = np.diag(density**2)
+        self.imu_walk = np.zeros(DIMENSION)
+        self.imu_walk[ATTITUDE] = config.gyro_noise**2
+        self.imu_walk[GYRO_BIAS] = config.gyro_bias_walk**2
+        self.imu_walk[ACCELEROMETER_BIAS] = config.accelerometer_bias_walk**2
 
-    def predict_by_imu(self, window: ImuWindow) -> None:
-        """Move on by what an IMU measured."""
-        if not self.knows_gravity:
-            self._look_down(window)
-        self.state, jacobians = propagate(self.state, window)
-        for dt, self.kf.F in zip(window.durations, jacobians, strict=True):
-            self.kf.Q = self.imu_walk * dt + _velocity_walk(self.config.accelerometer_noise, dt)
-            self.kf.predict()
+    def predict(self, window: ImuWindow | None, seconds: float) -> None:
+        """Move on to the next frame: by what an IMU measured, or else by constant velocity and rate."""
+        if window is not None:
+            self._predict_by_imu(window)
+            self._drift(seconds)
+        else:
+            self._predict_by_constancy(seconds)
 
-    def predict_by_constancy(self, dt: float) -> None:
-        """Move on with constant velocity in the world and constant rate in the body."""
-        config, state = self.config, self.state
-        turn = exp(self.rate * dt)
-        self.state = replace(state, R=state.R @ turn, p=state.p + state.v * dt)
-        self.kf.F = np.eye(DIMENSION)
-        self.kf.F[ATTITUDE, ATTITUDE] = turn.T
-        self.kf.F[POSITION, VELOCITY] = np.eye(3) * dt
-        variance = np.zeros(DIMENSION)
-        variance[ATTITUDE] = config.angular_acceleration**2 * dt**3
-        self.kf.Q = np.diag(variance) + _velocity_walk(config.acceleration, dt)
-        self.kf.predict()
+    def squared_innovation(self, measured: Measurement) -> float:
+        """Squared Mahalanobis distance from prediction to measurement: chi-square of 6 degrees of freedom."""
+        H = shown_jacobian(self.state, measured.seconds)
+        innovation = difference(measured.motion, self.state.shown(measured.seconds))
+        return float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + measured.covariance, innovation))
 
-    def drift(self, dt: float) -> None:
-        """Let the rate bias of the pairs fade and wander: a Gauss-Markov process."""
-        keep = np.exp(-dt / self.config.pair_correlation_s)
-        self.state = replace(self.state, pair_rate_bias=keep * self.state.pair_rate_bias)
-        factor, variance = np.ones(DIMENSION), np.zeros(DIMENSION)
-        factor[PAIR_RATE_BIAS] = keep
-        variance[PAIR_RATE_BIAS] = (1 - keep**2) * self.config.pair_rate_bias_sigma**2
-        self.kf.F, self.kf.Q = np.diag(factor), np.diag(variance)
-        self.kf.predict()
-
-    def forget_velocity(self) -> None:
-        """Make the velocity as uncertain as at first, and independent of all else."""
-        self.kf.P[VELOCITY, :] = 0.0
-        self.kf.P[:, VELOCITY] = 0.0
-        self.kf.P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
-
-    def squared_innovation(self, pair: FloatArray, covariance: FloatArray, dt: float) -> float:
-        """Squared Mahalanobis distance of a pair (4, 4) over dt s to the predicted: chi-square, 6 degrees of freedom."""
-        H = measurement_jacobian(self.state, dt)
-        innovation = difference(pair, self.state.measurement(dt))
-        return float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + covariance, innovation))
-
-    def update(self, pair: FloatArray, covariance: FloatArray, dt: float) -> None:
-        """Correct by a pair (4, 4) from the clone dt s ago (Joseph form), move the error into the state and reset it."""
+    def update(self, measured: Measurement) -> None:
+        """Correct by a measurement since the clone (Joseph form), move the error into the state and reset it."""
         self.kf.update(
-            pair,
-            HJacobian=lambda _: measurement_jacobian(self.state, dt),
-            Hx=lambda _: self.state.measurement(dt),
-            R=covariance,
+            measured.motion,
+            HJacobian=lambda _: shown_jacobian(self.state, measured.seconds),
+            Hx=lambda _: self.state.shown(measured.seconds),
+            R=measured.covariance,
             residual=difference,
         )
-        error = self.kf.x
-        G = reset_jacobian(error)
-        self.state = inject(self.state, error)
-        self.kf.P = G @ self.kf.P @ G.T
-        self.kf.P = (self.kf.P + self.kf.P.T) / 2
+        G = reset_jacobian(self.kf.x)
+        P = G @ self.kf.P @ G.T
+        self.kf.P = (P + P.T) / 2
+        self.state = inject(self.state, self.kf.x)
         self.kf.x = np.zeros(DIMENSION)
 
-    def clone(self, dt: float) -> None:
-        """Make the present pose, dt seconds after the clone, the next one; it errs as the present pose does."""
-        keep = np.exp(-dt / self.config.pair_correlation_s)
-        walk = np.diag([1.0, 1.0, 1.0, keep])
+    def clone(self, seconds: float) -> None:
+        """Make the present pose the clone, which lies that time back; it errs as the present pose does."""
+        walk = np.diag([1.0, 1.0, 1.0, self._keep(seconds)])
         walk[:3, 3] = self.state.p - self.state.p_clone
         self.by_scale = walk @ self.by_scale @ walk.T
-        self.by_scale[3, 3] += (1 - keep**2) * self.config.pair_scale_sigma**2
-        self.rate = log(self.state.motion[:3, :3]) / dt
+        self.by_scale[3, 3] += (1.0 - self._keep(seconds) ** 2) * self.config.pair_scale_sigma**2
+
+        self.rate = log(self.state.motion[:3, :3]) / seconds
         self.state = replace(self.state, R_clone=self.state.R, p_clone=self.state.p)
         copy = np.eye(DIMENSION)
         copy[CLONE_ATTITUDE] = copy[ATTITUDE]
         copy[CLONE_POSITION] = copy[POSITION]
         self.kf.P = copy @ self.kf.P @ copy.T
 
+    def forget_velocity(self) -> None:
+        """Make the velocity as uncertain as at first, and independent of all else."""
+        P = self.kf.P.copy()
+        P[VELOCITY], P[:, VELOCITY] = 0.0, 0.0
+        P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
+        self.kf.P = P
+
     def pose_covariance(self) -> FloatArray:
         """(6, 6) of the present pose, rotation first, right perturbation."""
-        to_body = np.eye(6)
-        to_body[3:, 3:] = self.state.R.T
         P = self.kf.P[:6, :6].copy()
-        P[3:, 3:] += self.by_scale[:3, :3]
+        P[POSITION, POSITION] += self.by_scale[:3, :3]
+        to_body = block_diag(np.eye(3), self.state.R.T)
         return np.asarray(to_body @ P @ to_body.T)
+
+    def _predict_by_imu(self, window: ImuWindow) -> None:
+        if not self.knows_gravity:
+            self._look_down(window)
+        self.state, jacobians = propagate(self.state, window)
+        for seconds, jacobian in zip(window.durations, jacobians, strict=True):
+            self._spread(jacobian, self.imu_walk * seconds, self.config.accelerometer_noise, seconds)
 
     def _look_down(self, window: ImuWindow) -> None:
         """Take gravity's direction from the first accelerations: an accelerometer at rest shows what holds it up."""
-        up = self.state.R @ (window.durations @ window.linear_acceleration)
-        to_up, _ = Rotation.align_vectors(-up[None], np.array([[0.0, 0.0, 1.0]]))
-        self.state = replace(self.state, Q=to_up.as_matrix())
+        down = -self.state.R @ (window.durations @ window.linear_acceleration)
+        rotation, _ = Rotation.align_vectors(down[None], [[0.0, 0.0, 1.0]])
+        self.state = replace(self.state, Q=rotation.as_matrix())
         self.knows_gravity = True
 
+    def _predict_by_constancy(self, seconds: float) -> None:
+        turn = exp(self.rate * seconds)
+        self.state = replace(self.state, R=self.state.R @ turn, p=self.state.p + self.state.v * seconds)
+        F = np.eye(DIMENSION)
+        F[ATTITUDE, ATTITUDE] = turn.T
+        F[POSITION, VELOCITY] = np.eye(3) * seconds
+        variances = np.zeros(DIMENSION)
+        variances[ATTITUDE] = self.config.angular_acceleration**2 * seconds**3
+        self._spread(F, variances, self.config.acceleration, seconds)
+        # Nothing tells the rate bias of the pairs from turning now: they are taken as they are.
+        self.state = replace(self.state, pair_rate_bias=np.zeros(3))
+        self.kf.P[PAIR_RATE_BIAS], self.kf.P[:, PAIR_RATE_BIAS] = 0.0, 0.0
 
-def _velocity_walk(density: float, dt: float) -> FloatArray:
-    """Covariance (26, 26) of a white acceleration of this density (m/s^2/sqrt(Hz)) over dt seconds."""
-    Q = np.zeros((DIMENSION, DIMENSION))
-    Q[POSITION, POSITION] = density**2 * dt**3 / 3 * np.eye(3)
-    Q[POSITION, VELOCITY] = Q[VELOCITY, POSITION] = density**2 * dt**2 / 2 * np.eye(3)
-    Q[VELOCITY, VELOCITY] = density**2 * dt * np.eye(3)
-    return Q
+    def _drift(self, seconds: float) -> None:
+        """Let the rate bias of the pairs fade and wander: a Gauss-Markov process."""
+        keep = self._keep(seconds)
+        self.state = replace(self.state, pair_rate_bias=keep * self.state.pair_rate_bias)
+        factors, variances = np.ones(DIMENSION), np.zeros(DIMENSION)
+        factors[PAIR_RATE_BIAS] = keep
+        variances[PAIR_RATE_BIAS] = (1.0 - keep**2) * self.config.pair_rate_bias_sigma**2
+        self._spread(np.diag(factors), variances, 0.0, seconds)
+
+    def _keep(self, seconds: float) -> float:
+        """What is left of a correlated error of the pairs after that time."""
+        return float(np.exp(-seconds / self.config.pair_correlation_s))
+
+    def _spread(self, jacobian: FloatArray, variances: FloatArray, acceleration: float, seconds: float) -> None:
+        """Move the covariance on: variances (26,) are added, and those of a white acceleration (m/s^2/sqrt(Hz))."""
+        self.kf.F, self.kf.Q = jacobian, np.diag(variances)
+        by_axis = acceleration**2 * seconds * np.eye(3)
+        self.kf.Q[VELOCITY, VELOCITY] += by_axis
+        self.kf.Q[VELOCITY, POSITION] += by_axis * seconds / 2
+        self.kf.Q[POSITION, VELOCITY] += by_axis * seconds / 2
+        self.kf.Q[POSITION, POSITION] += by_axis * seconds**2 / 3
+        self.kf.predict()
 
 
-def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: EkfConfig) -> EkfResult:
-    """Filter N > 0 steps that follow each other, with an IMU in the camera's axes and time, or without one."""
-    filter_ = Filter(config)
-    windows = ImuWindows(inertial) if inertial else None
-    threshold = chi2.isf(config.gate_probability, 6)
-    states, covariances = [filter_.state], [filter_.pose_covariance()]
-    nis = np.empty(len(steps))
+def solve(
+    steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: EkfConfig, gyro_bias_std: float = 0.0
+) -> EkfResult:
+    """Filter N > 0 steps that follow each other, with an IMU in the camera's axes and time, or None.
+
+    Steps that the IMU did not measure from start to end are predicted by constant velocity and rate. gyro_bias_std
+    (rad/s): how well a bias is known that was removed from the gyro.
+    """
+    imu = ImuWindows(inertial) if inertial is not None else None
+    ekf = Filter(config, gyro_bias_std)
+    gate = chi2.isf(config.gate_probability, 6)
+    states, covariances, nis = [ekf.state], [ekf.pose_covariance()], []
     measured = rejected = in_a_row = 0
-    for k, (step, pair) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
-        window = windows.over(step.source_stamp_ns, step.target_stamp_ns) if windows else None
-        before = filter_.state, filter_.kf.P
-        if window:
-            measured += 1
-            filter_.predict_by_imu(window)
-        else:
-            filter_.predict_by_constancy(step.duration_s)
-        filter_.drift(step.duration_s)
-        nis[k] = filter_.squared_innovation(pair, step.covariance, step.duration_s)
-        if nis[k] <= threshold:
+    for step, motion in zip(steps, motions_of(steps).as_matrix(), strict=True):
+        window = imu.over(step.source_stamp_ns, step.target_stamp_ns) if imu is not None else None
+        pair = Measurement(motion, step.covariance, step.duration_s)
+        measured += window is not None
+        before = ekf.state, ekf.kf.P
+        ekf.predict(window, pair.seconds)
+        nis.append(ekf.squared_innovation(pair))
+        if nis[-1] <= gate:
             in_a_row = 0
-            filter_.update(pair, step.covariance, step.duration_s)
+            ekf.update(pair)
         elif in_a_row < config.max_rejected_in_a_row:
             in_a_row += 1
             rejected += 1
         else:
-            filter_.state, filter_.kf.P = before
-            filter_.forget_velocity()
-            filter_.predict_by_constancy(step.duration_s)
-            filter_.drift(step.duration_s)
-            filter_.update(pair, step.covariance, step.duration_s)
-        filter_.clone(step.duration_s)
-        states.append(filter_.state)
-        covariances.append(filter_.pose_covariance())
-    poses = RigidTransform.from_components(
-        np.stack([s.p for s in states]), Rotation.from_matrix(np.stack([s.R for s in states]))
-    )
-    note = f"the IMU predicted {measured} of {len(steps)} steps, constant velocity the others"
-    final = filter_.state
+            ekf.state, ekf.kf.P = before
+            ekf.forget_velocity()
+            ekf.predict(None, pair.seconds)
+            ekf.update(pair)
+        ekf.clone(pair.seconds)
+        states.append(ekf.state)
+        covariances.append(ekf.pose_covariance())
+
+    rotations = Rotation.from_matrix(np.stack([state.R for state in states]))
+    poses = RigidTransform.from_components(np.stack([state.p for state in states]), rotations)
     return EkfResult(
-        Trajectory(stamps_of(steps), poses, np.stack(covariances)), rejected, nis, note,
-        final.gyro_bias, final.accelerometer_bias, final.gravity,
+        Trajectory(stamps_of(steps), poses, np.stack(covariances)),
+        rejected,
+        np.array(nis),
+        _note(measured, len(steps)),
+        ekf.state.gyro_bias,
+        ekf.state.accelerometer_bias,
+        ekf.state.gravity,
     )
+
+
+def _note(measured: int, steps: int) -> str:
+    if measured == 0:
+        return "predicted by constant velocity: no IMU"
+    if measured < steps:
+        return f"predicted by the IMU on {measured} of {steps} steps, by constant velocity on the others"
+    return "predicted by the IMU"

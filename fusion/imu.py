@@ -81,9 +81,10 @@ class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
 
     rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
-    gyro_bias (3,) rad/s in IMU axes; zero where the pairs cannot tell it from zero. used, reason: the verdict and what
-    led to it. rotation_std_rad (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (rad/s, any axis): standard
-    deviations, zero for what was given or is taken to be zero. faulty_ns (M, 2): intervals on the IMU's clock in which the gyro contradicts the pairs for long.
+    gyro_bias (3,) rad/s in IMU axes, zero where the pairs cannot tell it from zero. used, reason: the verdict and what
+    led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad (3,) about the
+    camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2): intervals on the IMU's
+    clock in which the gyro contradicts the pairs for long.
     """
 
     rotation_imu_camera: Rotation | None
@@ -416,7 +417,9 @@ def _fit_problem(fit: _Fit) -> str | None:
     if rotation_std > MAX_ROTATION_STD_RAD:
         return f"the motion does not show its mounting (+-{np.rad2deg(rotation_std):.1f} deg)"
     if explained < (MIN_EXPLAINED if rotation_std > 0.0 else MIN_EXPLAINED_GIVEN):
-        return f"its gyro explains too little of the pairs' turning ({max(explained, 0.0):.0%}), or they turn too little"
+        return (
+            f"its gyro explains too little of the pairs' turning ({max(explained, 0.0):.0%}), or they turn too little"
+        )
     if min(by_axis) < MIN_EXPLAINED_AXIS:
         return f"its gyro turns the other way than the pairs about the camera's {'xyz'[int(np.argmin(by_axis))]} axis"
     if abs(scale - 1.0) > MAX_SCALE_ERROR + 2.0 * scale_std:

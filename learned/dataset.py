@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields
@@ -116,7 +117,9 @@ def simulate_shards(
     """Render all clips, a shard a task, yielding each file as it is finished (in order of the seeds)."""
     folder.mkdir(parents=True, exist_ok=True)
     stops = [*range(0, clips, CLIPS_A_SHARD), clips]
-    with ProcessPoolExecutor(workers, initializer=single_thread) as pool:
+    # A forked child would inherit the locks of OpenCV's and torch's threads, and wait for them for ever.
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=single_thread) as pool:
         tasks = []
         for start, stop in pairwise(stops):
             seeds = range(first_seed + start, first_seed + stop)
