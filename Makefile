@@ -10,7 +10,7 @@ STAMP  := $(VENV)/.installed
 .PHONY: demo test lint types bench clean
 
 demo: $(STAMP)
-	$(PY) -m fusion.run --log samples/kitti06.mcap --out runs/demo --segment-lengths 10,20,30,40,50
+	$(PY) -m fusion.run --log samples/kitti06.mcap --config samples/kitti06.toml --out runs/demo --segment-lengths 10,20,30,40,50
 
 test: lint types
 	$(PY) -m pytest

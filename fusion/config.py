@@ -120,8 +120,8 @@ class EkfConfig(Section):
     pair_rate_bias_sigma: PositiveFloat = 2e-3
     pair_scale_sigma: PositiveFloat = 0.02
     pair_correlation_s: PositiveFloat = 30.0
-    angular_acceleration: PositiveFloat = 0.5
-    acceleration: PositiveFloat = 2.0
+    angular_acceleration: PositiveFloat = 1.0
+    acceleration: PositiveFloat = 5.0
     gate_probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
     max_rejected_in_a_row: Annotated[int, Field(ge=0)] = 5
 

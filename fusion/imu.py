@@ -52,11 +52,14 @@ CONTRADICTION = 8.0  # standard deviations
 CONTRADICTION_PAIRS = 6  # at least so many in a row
 CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
 
-# A constant difference of gyro and pairs is the gyro's bias where chance and the drift of the pairs cannot explain it;
-# else the gyro is taken for one whose bias has been removed already, which is worth more than the pairs.
+# A gyro that a navigation system has corrected has hardly a bias, and knowing that is worth more than the pairs; a bare
+# one has a large bias, which only the pairs can tell. It is taken for the first where the pairs would see the biases of
+# bare gyros sharply, and yet show a difference that can be chance and their own drift.
+BARE_GYRO_BIAS = 1e-2  # rad/s
+SHARP = 0.1  # of it
+CHANCE = 0.02
 BATCHES = 5  # whose scatter shows how uncertain the mean of errors is that are correlated in time
 PAIR_DRIFT = 3e-4  # rad/s: constant over a log, so that no scatter shows it
-CHANCE = 0.02
 
 # An IMU has a hole where samples are further apart than this many of its periods.
 HOLE_PERIODS = 5.0
@@ -81,7 +84,7 @@ class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
 
     rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
-    gyro_bias (3,) rad/s in IMU axes, zero where the pairs cannot tell it from zero. used, reason: the verdict and what
+    gyro_bias (3,) rad/s in IMU axes, zero for a gyro that seems to have been corrected already. used, reason: the verdict and what
     led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad (3,) about the
     camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2): intervals on the IMU's
     clock in which the gyro contradicts the pairs for long.
@@ -126,7 +129,7 @@ def calibrate(
 
     fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
     problem = _fit_problem(fit)
-    gyro_bias, gyro_bias_std = _significant_bias(fit)
+    gyro_bias, gyro_bias_std = _gyro_bias(fit)
     return ImuCalibration(
         fit.rotation_imu_camera,
         fit.time_offset_s,
@@ -363,8 +366,8 @@ def _refine(gyro: _Gyro, turns: _Turns, rotation: Rotation | None, offset_s: flo
     )
 
 
-def _significant_bias(fit: _Fit) -> tuple[FloatArray, float]:
-    """The gyro's bias (3,) in IMU axes and its standard deviation, or zeros where it may as well be none.
+def _gyro_bias(fit: _Fit) -> tuple[FloatArray, float]:
+    """The gyro's bias (3,) in IMU axes and its standard deviation, or zeros for a gyro without one.
 
     The deviation of a mean of correlated errors follows from the scatter of the means of batches (Law and Carson,
     "A sequential procedure for determining the length of a steady-state simulation", 1979).
@@ -374,7 +377,8 @@ def _significant_bias(fit: _Fit) -> tuple[FloatArray, float]:
     batches = zip(np.array_split(errors, BATCHES), np.array_split(weight, BATCHES), strict=True)
     means = [np.average(values, axis=0, weights=weights) for values, weights in batches]
     variance = float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES + PAIR_DRIFT**2
-    if fit.gyro_bias @ fit.gyro_bias / (3 * variance) < f_distribution.isf(CHANCE, 3, 3 * (BATCHES - 1)):
+    highest = 3.0 * variance * f_distribution.isf(CHANCE, 3, 3 * (BATCHES - 1))
+    if variance < (SHARP * BARE_GYRO_BIAS) ** 2 and fit.gyro_bias @ fit.gyro_bias < highest:
         return np.zeros(3), 0.0
     return fit.gyro_bias, float(np.sqrt(variance))
 
