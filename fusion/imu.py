@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import f as f_distribution
 from scipy.stats import rankdata
 
+from fusion.chain import MAX_IMU_PERIODS
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate
 
 # The search for the time offset, and how well angular rates must correlate (by rank) where it is right.
@@ -61,9 +62,6 @@ CHANCE = 0.02
 BATCHES = 5  # whose scatter shows how uncertain the mean of errors is that are correlated in time
 PAIR_DRIFT = 3e-4  # rad/s: constant over a log, so that no scatter shows it
 
-# An IMU has a hole where samples are further apart than this many of its periods.
-HOLE_PERIODS = 5.0
-
 # Weak priors of the refinement: they keep it solvable where the motion leaves something open.
 ROTATION_PRIOR_RAD = 0.5
 GYRO_BIAS_PRIOR = 0.1  # rad/s
@@ -84,10 +82,10 @@ class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
 
     rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
-    gyro_bias (3,) rad/s in IMU axes, zero for a gyro that seems to have been corrected already. used, reason: the verdict and what
-    led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad (3,) about the
-    camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2): intervals on the IMU's
-    clock in which the gyro contradicts the pairs for long.
+    gyro_bias (3,) rad/s in IMU axes, zero for a gyro that seems to have been corrected already. used, reason: the
+    verdict and what led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad
+    (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2):
+    intervals on the IMU's clock in which the gyro contradicts the pairs for long.
     """
 
     rotation_imu_camera: Rotation | None
@@ -122,10 +120,10 @@ def calibrate(
         return left_out(f"it measured {covered.sum()} pairs from start to end, and {MIN_PAIRS} are needed")
     if covered.mean() < MIN_COVERAGE:
         return left_out(f"it measured only {covered.mean():.0%} of the pairs")
-    if time_offset_s is None and abs(offset_s) >= MAX_TIME_OFFSET_S:
-        return left_out(f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's")
     if correlation < MIN_CORRELATION:
         return left_out(f"its angular rates do not follow those of the pairs (correlation {correlation:.2f} at best)")
+    if time_offset_s is None and abs(offset_s) >= MAX_TIME_OFFSET_S:
+        return left_out(f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's")
 
     fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
     problem = _fit_problem(fit)
@@ -197,7 +195,7 @@ class _Gyro:
         orientations = np.stack(list(accumulate(increments, np.matmul, initial=np.eye(3))))
         self._orientation = Slerp(self._seconds, Rotation.from_matrix(orientations))
         self._angle = cumulative_trapezoid(np.linalg.norm(self._rates, axis=1), self._seconds, initial=0.0)
-        self._holes = np.concatenate([[0], np.cumsum(periods > HOLE_PERIODS * np.median(periods))])
+        self._holes = np.concatenate([[0], np.cumsum(periods > MAX_IMU_PERIODS * np.median(periods))])
 
     def measured(self, start_s: FloatArray, end_s: FloatArray) -> NDArray[np.bool_]:
         """Which intervals (N,) the samples cover from start to end without a hole."""
