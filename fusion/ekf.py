@@ -209,9 +209,9 @@ def inject(state: State, error: FloatArray) -> State:
 def reset_jacobian(error: FloatArray) -> FloatArray:
     """(26, 26): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
     G = np.eye(DIMENSION)
-    G[ATTITUDE, ATTITUDE] = right_jacobian(error[ATTITUDE])
-    G[CLONE_ATTITUDE, CLONE_ATTITUDE] = right_jacobian(error[CLONE_ATTITUDE])
-    G[GRAVITY_DIRECTION, GRAVITY_DIRECTION] = right_jacobian(np.append(error[GRAVITY_DIRECTION], 0.0))[:2, :2]
+    turns = np.stack([error[ATTITUDE], np.append(error[GRAVITY_DIRECTION], 0.0), error[CLONE_ATTITUDE]])
+    G[ATTITUDE, ATTITUDE], of_gravity, G[CLONE_ATTITUDE, CLONE_ATTITUDE] = right_jacobian(turns)
+    G[GRAVITY_DIRECTION, GRAVITY_DIRECTION] = of_gravity[:2, :2]
     return G
 
 
@@ -301,8 +301,8 @@ class Filter:
         if not self.knows_gravity:
             self._look_down(window)
         self.state, jacobians = propagate(self.state, window)
-        for seconds, jacobian in zip(window.durations, jacobians, strict=True):
-            self._spread(jacobian, self.imu_walk * seconds, self.config.accelerometer_noise, seconds)
+        variances = np.outer(window.durations, self.imu_walk)
+        self._spread(jacobians, variances, self.config.accelerometer_noise, window.durations)
 
     def _look_down(self, window: ImuWindow) -> None:
         """Take gravity's direction from the first accelerations: an accelerometer at rest shows what holds it up."""
@@ -319,7 +319,7 @@ class Filter:
         F[POSITION, VELOCITY] = np.eye(3) * seconds
         variances = np.zeros(DIMENSION)
         variances[ATTITUDE] = self.config.angular_acceleration**2 * seconds**3
-        self._spread(F, variances, self.config.acceleration, seconds)
+        self._spread(F[None], variances[None], self.config.acceleration, np.array([seconds]))
         # Nothing tells the rate bias of the pairs from turning now: they are taken as they are.
         self.state = replace(self.state, pair_rate_bias=np.zeros(3))
         self.kf.P[PAIR_RATE_BIAS], self.kf.P[:, PAIR_RATE_BIAS] = 0.0, 0.0
@@ -331,21 +331,26 @@ class Filter:
         factors, variances = np.ones(DIMENSION), np.zeros(DIMENSION)
         factors[PAIR_RATE_BIAS] = keep
         variances[PAIR_RATE_BIAS] = (1.0 - keep**2) * self.config.pair_rate_bias_sigma**2
-        self._spread(np.diag(factors), variances, 0.0, seconds)
+        self._spread(np.diag(factors)[None], variances[None], 0.0, np.array([seconds]))
 
     def _keep(self, seconds: float) -> float:
         """What is left of a correlated error of the pairs after that time."""
         return float(np.exp(-seconds / self.config.pair_correlation_s))
 
-    def _spread(self, jacobian: FloatArray, variances: FloatArray, acceleration: float, seconds: float) -> None:
-        """Move the covariance on: variances (26,) are added, and those of a white acceleration (m/s^2/sqrt(Hz))."""
-        self.kf.F, self.kf.Q = jacobian, np.diag(variances)
-        by_axis = acceleration**2 * seconds * np.eye(3)
-        self.kf.Q[VELOCITY, VELOCITY] += by_axis
-        self.kf.Q[VELOCITY, POSITION] += by_axis * seconds / 2
-        self.kf.Q[POSITION, VELOCITY] += by_axis * seconds / 2
-        self.kf.Q[POSITION, POSITION] += by_axis * seconds**2 / 3
-        self.kf.predict()
+    def _spread(self, jacobians: FloatArray, variances: FloatArray, acceleration: float, seconds: FloatArray) -> None:
+        """Move the covariance on over M pieces that last seconds (M,), with the jacobians (M, 26, 26) of each.
+
+        variances (M, 26) are added, and what a white acceleration of a density in m/s^2/sqrt(Hz) adds.
+        """
+        noise = variances[:, :, None] * np.eye(DIMENSION)
+        by_axis = (acceleration**2 * seconds)[:, None, None] * np.eye(3)
+        seconds = seconds[:, None, None]
+        noise[:, VELOCITY, VELOCITY] += by_axis
+        noise[:, VELOCITY, POSITION] += by_axis * seconds / 2
+        noise[:, POSITION, VELOCITY] += by_axis * seconds / 2
+        noise[:, POSITION, POSITION] += by_axis * seconds**2 / 3
+        for self.kf.F, self.kf.Q in zip(jacobians, noise, strict=True):
+            self.kf.predict()
 
 
 def solve(
