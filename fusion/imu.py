@@ -42,6 +42,7 @@ MIN_EXPLAINED = 0.5  # share of the pairs' turning (as variance) that the gyro e
 MIN_EXPLAINED_GIVEN = -0.1  # the same with a given mounting: on a straight road there is nothing to explain
 MIN_EXPLAINED_AXIS = -0.5  # about each axis; an axis that the gyro has reversed is at -3
 MAX_SCALE_ERROR = 0.01  # of the gyro against the pairs
+MAX_SCALE_ERROR_LEARNED = 0.05  # the same where the network made them: it takes a little sideways motion for turning
 MAX_ROTATION_STD_RAD = float(np.deg2rad(2.0))
 MAX_TIME_OFFSET_STD_S = 0.02
 GRAVITY_RANGE = (8.8, 10.8)  # m/s^2, for the median magnitude that the accelerometer shows
@@ -126,7 +127,8 @@ def calibrate(
         return left_out(f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's")
 
     fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
-    problem = _fit_problem(fit)
+    learned = any(pair.winner >= 0 for pair in pairs)
+    problem = _fit_problem(fit, MAX_SCALE_ERROR_LEARNED if learned else MAX_SCALE_ERROR)
     gyro_bias, gyro_bias_std = _gyro_bias(fit)
     return ImuCalibration(
         fit.rotation_imu_camera,
@@ -409,7 +411,7 @@ def _robust_std(values: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(MAD_TO_STD * np.median(np.abs(values), axis=0), np.finfo(float).eps))
 
 
-def _fit_problem(fit: _Fit) -> str | None:
+def _fit_problem(fit: _Fit, max_scale_error: float) -> str | None:
     """Why a fit does not carry the use of the IMU, or None."""
     rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
     *by_axis, explained = fit.explained
@@ -424,7 +426,7 @@ def _fit_problem(fit: _Fit) -> str | None:
         )
     if min(by_axis) < MIN_EXPLAINED_AXIS:
         return f"its gyro turns the other way than the pairs about the camera's {'xyz'[int(np.argmin(by_axis))]} axis"
-    if abs(scale - 1.0) > MAX_SCALE_ERROR + 2.0 * scale_std:
+    if abs(scale - 1.0) > max_scale_error + 2.0 * scale_std:
         return f"its gyro shows {1.0 / scale:.3g} times the turning of the pairs"
     if fit.faulty.mean() > MAX_FAULTY_SHARE:
         return f"its gyro contradicts the pairs for {fit.faulty.mean():.0%} of the time"
