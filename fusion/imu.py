@@ -436,8 +436,9 @@ def _fit_problem(fit: _Fit, max_scale_error: float) -> str | None:
 def _summary(fit: _Fit) -> str:
     """One line on what was estimated, and how well."""
     rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
-    mounting = f"estimated to {np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
-    offset = f"estimated to {1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
+    mounting = f"estimated to +-{np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
+    deviation = f"+-{1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
+    offset = f"{1e3 * fit.time_offset_s:.1f} ms ({deviation})"
     faulty = f"; left out in {len(fit.faulty_intervals())} faulty stretches" if fit.faulty.any() else ""
     explained = f"its gyro explains {fit.explained[-1]:.1%} of the turning of {len(fit.predicted)} pairs"
     return f"{explained}; mounting {mounting}, time offset {offset}{faulty}"

@@ -142,6 +142,7 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
             "warnings": {**log.warnings, **outcome.findings.counts},
         },
         "trajectories": {name: _values(outcome, name) for name in outcome.metrics},
+        "at_end": {name: _at_end(each) for name, each in outcome.trajectories.items()},
         "calibration": {
             "rotation_imu_camera_quat_wxyz": None if mounting is None else mounting.as_quat(scalar_first=True).tolist(),
             "time_offset_s": calibration.time_offset_s,
@@ -177,6 +178,23 @@ def _values(outcome: Outcome, name: str) -> dict[str, float | int | None]:
     """The measures of a trajectory; without ground truth not even the number of segments is known."""
     values = asdict(outcome.metrics[name])
     return values if outcome.ground_truth is not None else dict.fromkeys(values)
+
+
+def _at_end(trajectory: Trajectory) -> dict[str, Any]:
+    """Where the camera was at the end, in the frame of the first one, and how sure the back end is of it.
+
+    The sigmas are roots of the summed variances of the three axes.
+    """
+    end: dict[str, Any] = {
+        "position_m": trajectory.poses.translation[-1].tolist(),
+        "orientation_quat_wxyz": trajectory.poses.rotation[-1].as_quat(scalar_first=True).tolist(),
+        "path_length_m": trajectory.path_length_m,
+    }
+    if trajectory.covariances is not None:
+        variances = np.diag(trajectory.covariances[-1])
+        end["position_sigma_m"] = float(np.sqrt(variances[3:].sum()))
+        end["orientation_sigma_rad"] = float(np.sqrt(variances[:3].sum()))
+    return end
 
 
 def _provenance(outcome: Outcome) -> dict[str, dict[str, str]]:

@@ -56,7 +56,7 @@ def print_table(
         if any(value is not None for value in values):
             table.add_row(row.label, Text(row.unit), *_cells(row, values))
     table.add_section()
-    table.add_row("path length", "m", *(_number(_path_length(each), 1) for each in trajectories.values()))
+    table.add_row("path length", "m", *(_number(each.path_length_m, 1) for each in trajectories.values()))
     table.add_row("stated 1-sigma at the end", "m", *(_final_sigma(each) for each in trajectories.values()))
     console.print(Text(title))
     console.print(table)
@@ -85,11 +85,6 @@ def _legend(metrics: Mapping[str, Metrics]) -> str:
     if all(values["t_rel_percent"] is None for values in metrics.values()):
         return "Lower is better. No t_rel: the path is shorter than the shortest of --segment-lengths."
     return "Lower is better; an ANEES above 3 is overconfident."
-
-
-def _path_length(trajectory: Trajectory) -> float:
-    steps = np.diff(trajectory.poses.translation, axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
 
 
 def _final_sigma(trajectory: Trajectory) -> str:

@@ -98,8 +98,8 @@ def show(figures: dict[str, Any]) -> None:
 
     table = Table(title=f"{figures['pairs']} pairs, {figures['pairs_per_second']:.1f} pairs/s")
     table.add_column("estimate")
-    table.add_column("translation RMSE [m]", justify="right")
-    table.add_column("rotation RMSE [mrad]", justify="right")
+    table.add_column("translation RMSE (m)", justify="right")
+    table.add_column("rotation RMSE (mrad)", justify="right")
     for group in ("baselines", "by_level", "by_hypothesis"):
         for row in figures[group]:
             table.add_row(row["name"], f"{row['translation_rmse_m']:.4f}", f"{1e3 * row['rotation_rmse_rad']:.2f}")

@@ -138,6 +138,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    @property
+    def path_length_m(self) -> float:
+        """Length of the way along all positions."""
+        return float(np.linalg.norm(np.diff(self.poses.translation, axis=0), axis=1).sum())
+
     def at(self, stamps_ns: IntArray) -> RigidTransform:
         """Poses at stamps (M,) that the trajectory spans: linear position, slerp rotation."""
         t = (self.stamps_ns - self.stamps_ns[0]) / NANOSECONDS

@@ -38,7 +38,7 @@ def load(path: Path | None = None) -> tuple[VIOLearner, CovarianceModel]:
     except FileNotFoundError:
         raise LogError(f"{path}: no such weights file") from None
     except Exception as error:  # torch raises many kinds for a file that is not its own
-        raise LogError(f"{path}: not a weights file ({type(error).__name__})") from error
+        raise LogError(f"{path}: not a weights file") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise LogError(f"{path}: not a weights file of format {FORMAT}")
     model = VIOLearner(NetworkConfig(**content["config"]))
