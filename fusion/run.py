@@ -70,7 +70,7 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
     stopwatch.lap("raw")
 
     for name in back_ends(config):
-        if fused := fuse(name, steps, inertial, config, findings):
+        if fused := fuse(name, steps, inertial, calibration.gyro_bias_std, config, findings):
             trajectories[name], remarks[name] = fused
         stopwatch.lap(name)
 
@@ -135,9 +135,17 @@ def back_ends(config: RunConfig) -> Sequence[str]:
 
 
 def fuse(
-    name: str, steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: RunConfig, findings: Findings
+    name: str,
+    steps: Sequence[PairEstimate],
+    inertial: ImuSeries | None,
+    gyro_bias_std: float,
+    config: RunConfig,
+    findings: Findings,
 ) -> tuple[Trajectory, str] | None:
-    """The trajectory of a back end and its remark on it; None, and counted, where it fails: the others are not lost."""
+    """The trajectory of a back end and its remark on it; None, and counted, where it fails: the others are not lost.
+
+    gyro_bias_std: standard deviation (rad/s) of the gyro bias that was taken off `inertial`.
+    """
     import numpy as np
 
     try:
@@ -150,7 +158,7 @@ def fuse(
         else:
             from fusion import ekf
 
-            result = ekf.solve(steps, inertial, config.ekf)
+            result = ekf.solve(steps, inertial, config.ekf, gyro_bias_std)
             rejected = result.rejected
         if not np.all(np.isfinite(result.trajectory.poses.as_matrix())):
             raise FloatingPointError("a pose is not finite")
