@@ -130,6 +130,9 @@ def calibrate(
     learned = any(pair.winner >= 0 for pair in pairs)
     problem = _fit_problem(fit, MAX_SCALE_ERROR_LEARNED if learned else MAX_SCALE_ERROR)
     gyro_bias, gyro_bias_std = _gyro_bias(fit)
+    if learned:  # a few percent of a lasting turn look like a bias
+        rate = np.mean(fit.turns.turned, axis=0) / np.mean(fit.turns.target_s - fit.turns.source_s)
+        gyro_bias_std = float(np.hypot(gyro_bias_std, MAX_SCALE_ERROR_LEARNED * np.linalg.norm(rate)))
     return ImuCalibration(
         fit.rotation_imu_camera,
         fit.time_offset_s,
