@@ -16,7 +16,8 @@ def test_covariance_is_positive_definite_for_any_spread(seed: int, size: float) 
     hypotheses = RigidTransform.from_exp_coords(size * rng.normal(size=(4, 6))).as_matrix()[None]
     spread = hypothesis_spread(hypotheses, hypotheses[:, 0])
     P = CovarianceModel().covariance(spread, np.ones(1))[0]
-    assert np.linalg.matrix_rank(spread[0]) <= 3 or size == 0
+    if size > 1e-6:  # squares of less underflow, and a rank of rounding errors says nothing
+        assert np.linalg.matrix_rank(spread[0]) <= 3
     np.testing.assert_array_equal(P, P.T)
     assert np.linalg.eigvalsh(P)[0] > 0
 
