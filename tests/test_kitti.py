@@ -145,6 +145,76 @@ def test_malformed_files_of_a_sequence_are_refused_by_name(odometry, file, text,
         open_odometry(odometry, "42")
 
 
+def write_scan(path: Path, T_camera_velodyne: RigidTransform, depth: float) -> None:
+    """Points of a wall at a depth (m) of camera 0, which fill its image."""
+    pixels = np.random.default_rng(0).uniform([-8, -8], [72, 56], (20_000, 2))
+    points = depth * np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
+    path.parent.mkdir(parents=True, exist_ok=True)
+    reflectance = np.zeros((len(points), 1))
+    np.hstack([T_camera_velodyne.inv().apply(points), reflectance]).astype("<f4").tofile(path)
+
+
+@pytest.fixture
+def scanned(odometry) -> Path:
+    """The sequence with scans of a wall that comes 2 m nearer with each frame, and the scanner's calibration."""
+    folder = odometry / "sequences" / "42"
+    with (folder / "calib.txt").open("a") as file:
+        file.write(matrix_line("Tr", T_CAMERA_VELO.as_matrix()[:3]))
+    for i in range(FRAMES):
+        write_scan(folder / "velodyne" / f"{i:06d}.bin", T_CAMERA_VELO, 20.0 - 2 * i)
+    return odometry
+
+
+def test_depth_from_the_scanner_is_that_of_its_points(scanned):
+    recording = open_odometry(scanned, "42", depth="velodyne")
+    frames = list(recording.frames)
+    assert [frame.stamp_ns for frame in frames] == [i * 100_000_000 for i in range(FRAMES)]
+    for i, frame in enumerate(frames):
+        assert (frame.depth > 0).mean() > 0.95
+        assert_allclose(frame.depth[frame.depth > 0], 20.0 - 2 * i, rtol=1e-5)
+    assert not recording.warnings
+
+
+def test_stereo_goes_first_and_the_scanner_where_there_is_no_right_camera(scanned):
+    depth = next(iter(open_odometry(scanned, "42").frames)).depth
+    assert_allclose(np.median(depth[depth > 0]), 60 * 0.5 / 6, rtol=0.02)
+    folder = scanned / "sequences" / "42"
+    (folder / "image_1").rename(folder / "away")
+    depth = next(iter(open_odometry(scanned, "42").frames)).depth
+    assert_allclose(depth[depth > 0], 20, rtol=1e-5)
+
+
+def test_the_scanner_is_seen_from_the_camera_that_was_chosen(scanned):
+    """Camera 2 is 0.25 m to the left of camera 0: a point 4 m ahead of that is 3.75 pixels further right."""
+    near = T_CAMERA_VELO.inv().apply([0, 0.02, 4])
+    path = scanned / "sequences" / "42" / "velodyne" / "000000.bin"
+    np.append(near, 0).astype("<f4").tofile(path)
+    frame = next(iter(open_odometry(scanned, "42", depth="velodyne", colour=True).frames))
+    assert_array_equal(np.argwhere(frame.depth), [[24, 35]])
+
+
+def test_scans_that_are_missing_or_cut_leave_frames_without_depth_and_are_counted(scanned):
+    folder = scanned / "sequences" / "42" / "velodyne"
+    (folder / "000001.bin").unlink()
+    with (folder / "000003.bin").open("ab") as file:
+        file.write(b"rest")
+    recording = open_odometry(scanned, "42", depth="velodyne")
+    assert [frame.depth is None for frame in recording.frames] == [False, True, False, True, False, False]
+    assert recording.warnings == {"frames without depth (no scan)": 1, "frames without depth (scan cannot be read)": 1}
+
+
+def test_the_scanner_needs_its_calibration_and_its_folder(odometry):
+    with pytest.raises(LogError, match="velodyne: no such folder"):
+        open_odometry(odometry, "42", depth="velodyne")
+    (odometry / "sequences" / "42" / "velodyne").mkdir()
+    with pytest.raises(LogError, match=r"calib\.txt: no Tr"):
+        open_odometry(odometry, "42", depth="velodyne")
+    with (odometry / "sequences" / "42" / "calib.txt").open("a") as file:
+        file.write(matrix_line("Tr", 2 * np.eye(3, 4)))
+    with pytest.raises(LogError, match=r"calib\.txt: Tr is not a rigid transform"):
+        open_odometry(odometry, "42", depth="velodyne")
+
+
 def test_what_is_not_there_is_refused_by_name(odometry):
     with pytest.raises(LogError, match="43: no such sequence"):
         open_odometry(odometry, "43")
@@ -204,6 +274,144 @@ def test_files_without_an_imu_table_are_refused(tmp_path):
         read_imu_mat(tmp_path / "empty.mat", STAMPS)
     with pytest.raises(LogError, match=r"gone\.mat"):
         read_imu_mat(tmp_path / "gone.mat", STAMPS)
+
+
+# ------------------------------------------------------------------------------- the IMU of the raw drive's unit
+
+DAY_NS = int(np.datetime64("2011-09-30T12:00:00", "ns").astype(np.int64))
+
+
+def write_timestamps(path: Path, stamps_ns: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stamps = np.asarray(stamps_ns, dtype=np.int64).astype("datetime64[ns]")
+    path.write_text("".join(f"{str(stamp).replace('T', ' ')}\n" for stamp in stamps))
+
+
+def write_oxts(folder: Path, stamps_ns: np.ndarray) -> None:
+    """Records whose angular rates and accelerations (x) are the seconds since DAY_NS."""
+    write_timestamps(folder / "timestamps.txt", stamps_ns)
+    (folder / "data").mkdir()
+    for i, stamp in enumerate(stamps_ns):
+        record = np.zeros(30)
+        record[[11, 17]] = (stamp - DAY_NS) * 1e-9
+        (folder / "data" / f"{i:010d}.txt").write_text(" ".join(map(repr, record.tolist())))
+
+
+@pytest.fixture
+def day(odometry) -> Path:
+    """The folder of sequence 09's raw drive: 100 Hz for 1.5 s, and the synchronised one from its third frame on."""
+    for folder, suffix in ((odometry / "sequences", ""), (odometry / "poses", ".txt")):
+        (folder / f"42{suffix}").rename(folder / f"09{suffix}")
+    day = odometry / "2011_09_30"
+    write_oxts(day / "2011_09_30_drive_0033_extract" / "oxts", DAY_NS + np.arange(150) * 10_000_000)
+    frames = np.arange(3, 3 + FRAMES)
+    sync = day / "2011_09_30_drive_0033_sync"
+    write_timestamps(sync / "image_00" / "timestamps.txt", DAY_NS + 4_000_000 + frames * 100_000_000)
+    write_oxts(sync / "oxts", DAY_NS + frames * 100_000_000 + np.resize([1_000_000, 3_000_000, 8_000_000], FRAMES))
+    return day
+
+
+def test_the_imu_of_the_raw_drive_keeps_its_stamps_and_the_frames_get_theirs(day):
+    recording = open_odometry(day.parent, "09", oxts=day / "2011_09_30_drive_0033_extract")
+    frames = [frame.stamp_ns for frame in recording.frames]
+    assert_array_equal(frames, DAY_NS + 304_000_000 + np.arange(FRAMES) * 100_000_000)
+    assert_array_equal(recording.ground_truth.stamps_ns, frames)
+    imu = recording.imu
+    assert_array_equal(imu.stamps_ns, DAY_NS + np.arange(131) * 10_000_000)  # to half a second after the last frame
+    assert_allclose(imu.angular_velocity[:, 0], (imu.stamps_ns - DAY_NS) * 1e-9, atol=1e-12)
+    assert_allclose(imu.linear_acceleration[:, 0], (imu.stamps_ns - DAY_NS) * 1e-9, atol=1e-12)
+    assert not recording.warnings
+
+
+def test_the_folder_of_the_records_itself_may_be_named(day):
+    drive = day / "2011_09_30_drive_0033_extract"
+    named, inside = (open_odometry(day.parent, "09", oxts=folder) for folder in (drive, drive / "oxts"))
+    assert_array_equal(named.imu.stamps_ns, inside.imu.stamps_ns)
+
+
+def test_a_synchronised_drive_has_an_imu_at_the_rate_of_its_frames(day):
+    recording = open_odometry(day.parent, "09", oxts=day / "2011_09_30_drive_0033_sync")
+    assert len(recording.imu) == FRAMES
+    assert next(iter(recording.frames)).stamp_ns - recording.imu.stamps_ns[0] == 3_000_000
+
+
+def test_without_the_camera_s_stamps_the_records_of_the_frames_tie_the_clocks_and_it_is_said(day):
+    (day / "2011_09_30_drive_0033_sync" / "image_00" / "timestamps.txt").unlink()
+    recording = open_odometry(day.parent, "09", oxts=day / "2011_09_30_drive_0033_extract")
+    # the median of records that are 1, 3 and 8 ms after the full tenth of a second
+    assert next(iter(recording.frames)).stamp_ns == DAY_NS + 303_000_000
+    name = "frames tied to the OXTS clock by its records, to some ms (no image_00/timestamps.txt)"
+    assert recording.warnings == {name: FRAMES}
+
+
+def test_sequence_08_begins_at_frame_1100_of_its_drive(day):
+    for folder, suffix in ((day.parent / "sequences", ""), (day.parent / "poses", ".txt")):
+        (folder / f"09{suffix}").rename(folder / f"08{suffix}")
+    frames_ns = DAY_NS + np.arange(1100 + FRAMES) * 100_000_000
+    write_timestamps(day / "2011_09_30_drive_0028_sync" / "image_00" / "timestamps.txt", frames_ns)
+    write_oxts(day / "2011_09_30_drive_0028_extract" / "oxts", DAY_NS + 109_000_000_000 + np.arange(200) * 10_000_000)
+    recording = open_odometry(day.parent, "08", oxts=day / "2011_09_30_drive_0028_extract")
+    assert [frame.stamp_ns for frame in recording.frames] == frames_ns[1100:].tolist()
+    assert recording.imu.stamps_ns[0] == frames_ns[1100] - 500_000_000
+
+
+def test_repeated_and_backward_stamps_of_the_records_are_dropped_and_holes_counted(day):
+    drive = day / "2011_09_30_drive_0033_extract"
+    stamps_ns = DAY_NS + np.arange(150) * 10_000_000
+    stamps_ns[40] = stamps_ns[39]
+    stamps_ns[60] = stamps_ns[50]
+    stamps_ns[80:] += 100_000_000
+    write_timestamps(drive / "oxts" / "timestamps.txt", stamps_ns)
+    recording = open_odometry(day.parent, "09", oxts=drive)
+    assert (np.diff(recording.imu.stamps_ns) > 0).all()
+    assert recording.warnings == {
+        "OXTS records dropped (their time does not increase)": 2,
+        "holes between OXTS records": 1,
+    }
+
+
+def test_the_mounting_comes_from_the_calibration_of_the_day(day):
+    drive = day / "2011_09_30_drive_0033_extract"
+    assert open_odometry(day.parent, "09", oxts=drive).rotation_imu_camera is None
+    with (day.parent / "sequences" / "09" / "calib.txt").open("a") as file:
+        file.write(matrix_line("Tr", T_CAMERA_VELO.as_matrix()[:3]))
+    (day / "calib_imu_to_velo.txt").write_text(
+        matrix_line("R", T_VELO_IMU.rotation.as_matrix()) + matrix_line("T", T_VELO_IMU.translation)
+    )
+    mounting = open_odometry(day.parent, "09", oxts=drive).rotation_imu_camera
+    assert_allclose(mounting.as_matrix(), (T_CAMERA_VELO * T_VELO_IMU).rotation.inv().as_matrix(), atol=1e-12)
+
+
+def test_drives_that_do_not_belong_to_the_sequence_are_refused(day):
+    for other in ("10", "11"):
+        (day.parent / "sequences" / other).symlink_to(day.parent / "sequences" / "09")
+    with pytest.raises(LogError, match="drive_0033_sync: sequence 10 was recorded on drive 2011_09_30_drive_0034"):
+        open_odometry(day.parent, "10", oxts=day / "2011_09_30_drive_0033_sync")
+    with pytest.raises(UsageError, match="sequence 11: its raw drive is not published"):
+        open_odometry(day.parent, "11", oxts=day / "2011_09_30_drive_0033_sync")
+    with pytest.raises(LogError, match="gone: no such drive"):
+        open_odometry(day.parent, "09", oxts=day / "gone")
+
+
+def test_records_of_another_time_than_the_sequence_are_refused(day):
+    drive = day / "2011_09_30_drive_0033_extract"
+    write_timestamps(drive / "oxts" / "timestamps.txt", DAY_NS - 10**10 + np.arange(150) * 10_000_000)
+    with pytest.raises(LogError, match="0033_extract: the images and the IMU do not overlap in time"):
+        open_odometry(day.parent, "09", oxts=drive)
+
+
+def test_frames_that_cannot_be_tied_to_the_clock_are_refused(day):
+    extract, sync = (day / f"2011_09_30_drive_0033_{kind}" for kind in ("extract", "sync"))
+    times = sync / "image_00" / "timestamps.txt"
+    write_timestamps(times, DAY_NS + np.arange(FRAMES) * 150_000_000)
+    with pytest.raises(LogError, match=r"timestamps\.txt: its time stamps are not those of the sequence's frames"):
+        open_odometry(day.parent, "09", oxts=extract)
+    write_timestamps(times, DAY_NS + np.arange(4) * 100_000_000)
+    with pytest.raises(LogError, match=r"timestamps\.txt: 4 time stamps, the sequence has 6"):
+        open_odometry(day.parent, "09", oxts=extract)
+    sync.rename(day / "away")
+    with pytest.raises(LogError, match=r"0033_sync/image_00/timestamps\.txt: No such file: it ties"):
+        open_odometry(day.parent, "09", oxts=extract)
 
 
 def test_imu_of_a_range_reaches_half_a_second_beyond_it(odometry, tmp_path):
@@ -318,6 +526,19 @@ def test_missing_images_and_records_of_a_drive_are_counted(drive):
         "frames without depth (no right image)": 1,
         "OXTS records missing": 1,
     }
+
+
+def test_a_drive_has_depth_from_its_scanner(drive):
+    """Through the calibration files: rectification and scanner to camera."""
+    T_camera_velodyne = RigidTransform.from_rotation(RECTIFICATION) * T_CAMERA_VELO
+    for i in range(1, FRAMES):
+        write_scan(drive / "velodyne_points" / "data" / f"{i:010d}.bin", T_camera_velodyne, 12.0)
+    recording = open_raw(drive, depth="velodyne")
+    frames = list(recording.frames)
+    assert [frame.depth is None for frame in frames] == [True] + [False] * (FRAMES - 1)
+    assert (frames[1].depth > 0).mean() > 0.95
+    assert_allclose(frames[1].depth[frames[1].depth > 0], 12, rtol=1e-5)
+    assert recording.warnings == {"frames without depth (no scan)": 1}
 
 
 def test_records_whose_time_does_not_increase_are_dropped_and_counted(drive):

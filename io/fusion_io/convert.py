@@ -80,25 +80,39 @@ def _add_kind(
 
 def _add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = """The official layout: sequences/NN with image_0 and image_1 (grey) or image_2 and image_3
-        (colour), calib.txt, times.txt, and poses/NN.txt as ground truth if it is there. Depth comes from stereo."""
+        (colour), calib.txt, times.txt, velodyne if it is there, and poses/NN.txt as ground truth if it is there."""
     parser.add_argument("--root", type=Path, required=True, metavar="DIR", help="the folder of sequences/ and poses/")
     parser.add_argument("--sequence", required=True, metavar="NN", help="name of the sequence, such as 06")
-    parser.add_argument("--imu", type=Path, metavar="FILE.mat", help="the sequence's IMU, ten rows a frame")
-    _add_stereo_arguments(parser)
+    imu = parser.add_mutually_exclusive_group()
+    imu.add_argument("--imu", type=Path, metavar="FILE.mat", help="the sequence's IMU, ten rows a frame")
+    imu.add_argument(
+        "--oxts",
+        type=Path,
+        metavar="DIR",
+        help="the folder of the sequence's raw drive, whose OXTS unit is the IMU: ..._extract (100 Hz; the ..._sync "
+        "drive beside it tells the times of the frames) or ..._sync (10 Hz)",
+    )
+    _add_kitti_arguments(parser)
 
 
 def _add_raw_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = """A drive of rectified images with its OXTS unit as IMU and, moved into the left camera, as
-        ground truth. Depth comes from stereo."""
+        ground truth."""
     parser.add_argument("--drive", type=Path, required=True, metavar="DIR", help="the drive's folder, ..._sync")
     parser.add_argument(
         "--calib", type=Path, metavar="DIR", help="the folder of calib_*.txt (default: the folder that the drive is in)"
     )
     parser.add_argument("--gnss", action="store_true", help="also take the OXTS positions as GNSS fixes")
-    _add_stereo_arguments(parser)
+    _add_kitti_arguments(parser)
 
 
-def _add_stereo_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_kitti_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--depth",
+        choices=("stereo", "velodyne"),
+        help="where depth comes from (default: stereo, if there is a right camera). A scan's points are sparse, and "
+        "nothing is filled in between: take it with --resize to the network's size",
+    )
     parser.add_argument(
         "--frames", type=frame_range, default=slice(None), metavar="A:B", help="only frames A to B - 1 (default: all)"
     )
@@ -228,7 +242,14 @@ def _open_odometry(args: argparse.Namespace) -> Recording:
     from fusion_io import kitti
 
     return kitti.open_odometry(
-        args.root, args.sequence, imu=args.imu, frames=args.frames, colour=args.colour, framing=_framing(args)
+        args.root,
+        args.sequence,
+        imu=args.imu,
+        oxts=args.oxts,
+        depth=args.depth,
+        frames=args.frames,
+        colour=args.colour,
+        framing=_framing(args),
     )
 
 
@@ -236,7 +257,13 @@ def _open_raw(args: argparse.Namespace) -> Recording:
     from fusion_io import kitti
 
     return kitti.open_raw(
-        args.drive, args.calib, frames=args.frames, colour=args.colour, gnss=args.gnss, framing=_framing(args)
+        args.drive,
+        args.calib,
+        depth=args.depth,
+        frames=args.frames,
+        colour=args.colour,
+        gnss=args.gnss,
+        framing=_framing(args),
     )
 
 

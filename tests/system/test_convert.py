@@ -113,6 +113,31 @@ def test_an_odometry_sequence_becomes_a_log(odometry, tmp_path, capsys):
     }
 
 
+def test_the_scanner_of_a_sequence_gives_the_depth_of_the_log(odometry, tmp_path, capsys):
+    """Real images and calibration; the scan is a wall 15 m ahead, its calibration an assumed one."""
+    folder = tmp_path / "sequences/06"
+    (folder / "velodyne").mkdir(parents=True)
+    for name in ("image_0", "times.txt"):
+        (folder / name).symlink_to(odometry / "sequences/06" / name)
+    velodyne_in_camera = "0 -1 0 0 0 0 -1 0 1 0 0 0"  # forward, left, up
+    calibration = (odometry / "sequences/06/calib.txt").read_text()
+    (folder / "calib.txt").write_text(f"{calibration}Tr: {velodyne_in_camera}\n")
+    left, up = np.random.default_rng(0).uniform(-15, 15, (2, 200_000))
+    scan = np.column_stack([np.full_like(left, 15.0), left, up, np.zeros_like(left)])
+    scan.astype("<f4").tofile(folder / "velodyne/000000.bin")
+    out = tmp_path / "06.mcap"
+    arguments = ["--sequence=06", "--frames=0:2", "--resize=240x64", "--depth=velodyne", f"--out={out}"]
+    assert main(["kitti-odometry", f"--root={tmp_path}", *arguments]) == 0
+    assert capsys.readouterr().err == "warning: 1 frames without depth (no scan)\n"
+    log = open_log(out)
+    first, second = log.frames()
+    assert first.depth.shape == (64, 240)
+    assert (first.depth == 15).mean() > 0.7
+    assert (first.depth[first.depth != 15] == 0).all()
+    assert second.depth is None
+    assert log.metadata["converter"]["depth"] == "velodyne"
+
+
 def test_a_raw_drive_becomes_a_log_with_its_mounting(shared_data, tmp_path, capsys):
     drive = shared_data / "kitti/raw/2011_09_26/2011_09_26_drive_0039_sync"
     out = tmp_path / "39.mcap"
@@ -181,6 +206,8 @@ def test_the_same_recording_gives_the_same_bytes_whatever_it_is_called(recorded,
         ["kitti-odometry", "--root=.", "--sequence=06", "--out=x.mcap", "--resize=480"],
         ["kitti-odometry", "--root=.", "--sequence=06", "--out=x.mcap", "--frames=5"],
         ["kitti-odometry", "--root=.", "--sequence=06", "--out=x.mcap", "--crop-height=-1"],
+        ["kitti-odometry", "--root=.", "--sequence=06", "--out=x.mcap", "--depth=lidar"],
+        ["kitti-odometry", "--root=.", "--sequence=06", "--out=x.mcap", "--imu=a.mat", "--oxts=drive"],
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):
