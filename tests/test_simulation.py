@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion_io import convert, kitti, simulation, trajectory_files
 from fusion_io.reader import open_log
 from fusion_io.records import NANOSECONDS, Trajectory
-from fusion_io.simulation import clips, logs
+from fusion_io.simulation import logs
 from fusion_io.simulation.motion import (
     PERFECT_IMU,
     ROTATION_WORLD_CAMERA_LEVEL,
@@ -315,31 +315,8 @@ def test_clips_have_what_training_needs():
             assert frame.image.shape[:2] == frame.depth.shape == (32, 64)
             assert frame.depth.dtype == np.float32
             assert (frame.depth >= 0).all()
-            assert (frame.depth > 0).mean() > 0.2
+            assert (frame.depth > 0).mean() > 0.05
             assert frame.depth.max() < 80
-
-
-def test_noise_of_stereo_depth_grows_with_the_square_of_depth():
-    """Disparity noise: sixteen times at four times the distance."""
-    rng = np.random.default_rng(0)
-    spread = {}
-    for z in (10.0, 40.0):
-        measured = clips.stereo_depth(np.full((200, 400), z, np.float32), 140.0, 0.02, rng)
-        spread[z] = (measured[measured > 0] - z).std()
-    assert spread[40.0] / spread[10.0] == pytest.approx(16.0, rel=0.1)
-
-
-def test_stereo_sees_no_depth_left_of_near_things_nor_far_away():
-    """Occlusion by a near thing opens a hole at its left, as wide as the disparities differ; the sky has no depth."""
-    depth = np.full((100, 200), 40.0, np.float32)
-    depth[:, 80:120] = 4.0
-    depth[:20] = 0.0
-    depth[20:40] = 90.0
-    measured = clips.stereo_depth(depth, 140.0, 0.0, np.random.default_rng(1))
-    assert (measured[:40] == 0).all()
-    hidden = int(140.0 * 0.54 * (1 / 4 - 1 / 40))
-    assert (measured[40:, 80 - hidden + 1 : 80] == 0).all()
-    assert (measured[40:, 120 : 120 + hidden] > 0).mean() > 0.8
 
 
 # ---------------------------------------------------------------------------------------------------- logs
@@ -379,6 +356,79 @@ def test_the_imu_of_a_log_agrees_with_its_ground_truth(tmp_path):
     for start, end, rotation in zip(truth.stamps_ns[:-1], truth.stamps_ns[1:], rotations, strict=True):
         between = (imu.stamps_ns >= start) & (imu.stamps_ns <= end)
         np.testing.assert_allclose(gyro[between].mean(axis=0) * (end - start) / NANOSECONDS, rotation, atol=2e-3)
+
+
+@pytest.mark.parametrize("carrier", ["vehicle", "handheld", "drone"])
+def test_every_carrier_gives_a_log_with_its_own_motion(tmp_path, carrier):
+    """Frames with depth, an IMU, and a ground truth that moves as the carrier does."""
+    out = tmp_path / "journey.mcap"
+    assert simulate(out, "--motion", carrier, "--seconds", "3", "--frame-rate", "2", "--size", "32x16") == 0
+    log = open_log(out)
+    truth, imu = log.ground_truth(), log.imu()
+    distance = np.linalg.norm(np.diff(truth.poses.translation, axis=0), axis=1).sum()
+    low, high = {"vehicle": (12, 40), "handheld": (1, 6), "drone": (6, 20)}[carrier]
+    assert low < distance < high
+    assert np.linalg.norm(imu.linear_acceleration.mean(axis=0)) == pytest.approx(9.81, abs=2.0)
+    assert all((frame.depth > 0).any() for frame in log.frames())
+
+
+def test_a_long_flight_keeps_its_road(tmp_path):
+    """Wherever a drone flies, there is ground below it."""
+    out = tmp_path / "flight.mcap"
+    assert simulate(out, "--motion", "drone", "--seconds", "60", "--frame-rate", "0.2", "--size", "32x16") == 0
+    assert all((frame.depth[-1] > 0).all() for frame in open_log(out).frames())
+
+
+def test_sensors_and_photometry_change_what_they_say(tmp_path):
+    """Exact, stereo, LiDAR and ToF differ in depth alone; real photometry in the image."""
+    frames = {}
+    for depth in ("exact", "stereo", "lidar", "tof"):
+        out = tmp_path / f"{depth}.mcap"
+        assert simulate(out, "--depth", depth, "--seconds", "0.1", "--size", "240x64") == 0
+        frames[depth] = next(iter(open_log(out).frames()))
+    shares = {depth: (frame.depth > 0).mean() for depth, frame in frames.items()}
+    assert shares["exact"] > shares["stereo"] > shares["lidar"] > shares["tof"] > 0
+    assert frames["tof"].depth.max() < 8.01
+    for frame in frames.values():
+        np.testing.assert_array_equal(frame.image, frames["exact"].image)
+    assert simulate(tmp_path / "r.mcap", "--photometry", "real", "--seconds", "0.1", "--size", "240x64") == 0
+    real = next(iter(open_log(tmp_path / "r.mcap").frames()))
+    np.testing.assert_array_equal(real.depth, frames["exact"].depth)
+    assert np.abs(real.image.astype(int) - frames["exact"].image).mean() > 2
+
+
+def test_moving_cars_change_the_images_only(tmp_path):
+    """With cars the ground truth and the IMU stay, and some frame sees one."""
+    logs_read = []
+    for cars in ("0", "6"):
+        out = tmp_path / f"{cars}.mcap"
+        assert simulate(out, "--moving-cars", cars, "--seconds", "2", "--frame-rate", "4", "--size", "64x32") == 0
+        logs_read.append(open_log(out))
+    empty, busy = logs_read
+    np.testing.assert_array_equal(empty.ground_truth().poses.as_matrix(), busy.ground_truth().poses.as_matrix())
+    np.testing.assert_array_equal(empty.imu().angular_velocity, busy.imu().angular_velocity)
+    changed = [(a.depth != b.depth).mean() for a, b in zip(empty.frames(), busy.frames(), strict=True)]
+    assert 0.005 < max(changed) < 0.7
+
+
+def test_offset_and_dropout_of_the_imu_are_in_the_log(tmp_path):
+    """With t_imu = t_camera + 50 ms the truth's rotations fit the rates 50 ms later; a tenth of the samples is gone."""
+    out = tmp_path / "drive.mcap"
+    options = ["--seconds", "5", "--frame-rate", "10", "--size", "8x8", "--imu-rate", "200", "--motion", "handheld"]
+    assert simulate(out, *options, "--imu-offset-ms", "50", "--imu-dropout", "0.1", "--write-mounting") == 0
+    log = open_log(out)
+    imu, truth = log.imu(), log.ground_truth()
+    lost = 1 - len(imu) * 0.005 / ((imu.stamps_ns[-1] - imu.stamps_ns[0]) / NANOSECONDS)
+    assert 0.07 < lost < 0.2
+    rotations = (truth.poses[:-1].inv() * truth.poses[1:]).rotation.as_rotvec()
+    middles = 0.5 * (truth.stamps_ns[:-1] + truth.stamps_ns[1:])
+    gyro = log.mounting().inv().apply(imu.angular_velocity)
+
+    def misfit(offset_ms: float) -> float:
+        rates = [np.interp(middles + 1e6 * offset_ms, imu.stamps_ns, axis) for axis in gyro.T]
+        return float(np.square(np.column_stack(rates) * 0.1 - rotations).sum())
+
+    assert min(range(-100, 101, 10), key=misfit) == 50
 
 
 def test_the_same_arguments_give_the_same_bytes(tmp_path):
@@ -438,6 +488,8 @@ def test_the_real_imu_comes_with_a_real_trajectory(tmp_path, shared_data):
         (["--imu", "x.mat"], "belong to --poses"),
         (["--poses", "p.txt", "--imu", "x.mat"], "give --times"),
         (["--poses", "p.txt", "--times", "t.txt", "--imu", "x.mat", "--write-mounting"], "mounting of its own"),
+        (["--poses", "p.txt", "--times", "t.txt", "--imu", "x.mat", "--imu-offset-ms", "5"], "offset of its own"),
+        (["--poses", "p.txt", "--motion", "drone"], "is the motion"),
         (["--poses", "p.txt"], "p.txt"),
     ],
 )
@@ -451,7 +503,16 @@ def test_arguments_that_do_not_fit_are_refused(tmp_path, capsys, monkeypatch, ar
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--size", "480"], ["--size", "4x4"], ["--seconds", "0"], ["--seed", "-1"], ["--fov-deg", "180"]],
+    [
+        ["--size", "480"],
+        ["--size", "4x4"],
+        ["--seconds", "0"],
+        ["--seed", "-1"],
+        ["--fov-deg", "180"],
+        ["--imu-dropout", "1"],
+        ["--moving-cars", "-1"],
+        ["--depth", "sonar"],
+    ],
 )
 def test_impossible_values_are_usage_errors(tmp_path, arguments):
     with pytest.raises(SystemExit) as refusal:

@@ -5,9 +5,10 @@ The world is z up. The camera's axes are the optical ones (x right, y down, z fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation, RotationSpline
@@ -64,7 +65,8 @@ class ImuModel:
 
     rotation_imu_camera: v_imu = R v_camera. lever_arm (3,): the IMU's place in camera axes, metres.
     time_offset_s: t_imu = t_camera + offset. Biases (3,) are constant, in IMU axes; the noise
-    densities are in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). The defaults are those of a good MEMS unit.
+    densities are in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). gyro_scale_error: the share by which the gyro
+    shows too much. The defaults are those of a good MEMS unit.
     """
 
     rotation_imu_camera: Rotation = ROTATION_IMU_CAMERA_KITTI
@@ -74,6 +76,7 @@ class ImuModel:
     accelerometer_bias: FloatArray = field(default_factory=lambda: np.array([0.03, -0.05, 0.04]))
     gyro_noise: float = 1e-4
     accelerometer_noise: float = 2e-3
+    gyro_scale_error: float = 0.0
 
 
 PERFECT_IMU = ImuModel(gyro_bias=np.zeros(3), accelerometer_bias=np.zeros(3), gyro_noise=0.0, accelerometer_noise=0.0)
@@ -104,11 +107,30 @@ def simulate_imu(motion: Motion, stamps_ns: IntArray, rate_hz: float, model: Imu
     turn = model.rotation_imu_camera.apply
     return ImuSeries(
         stamps_ns,
-        turn(rate) + model.gyro_bias + gyro_std * gyro_error,
+        turn((1.0 + model.gyro_scale_error) * rate) + model.gyro_bias + gyro_std * gyro_error,
         turn(force) + model.accelerometer_bias + accelerometer_std * accelerometer_error,
         float(gyro_std),
         float(accelerometer_std),
     )
+
+
+def without(imu: ImuSeries, dropped: NDArray[np.bool_]) -> ImuSeries:
+    """The series less the samples that are marked (N,)."""
+    return replace(
+        imu,
+        stamps_ns=imu.stamps_ns[~dropped],
+        angular_velocity=imu.angular_velocity[~dropped],
+        linear_acceleration=imu.linear_acceleration[~dropped],
+    )
+
+
+def draw_dropouts(rng: np.random.Generator, stamps_ns: IntArray, share: float, bursts: int) -> NDArray[np.bool_]:
+    """Marks (N,) of samples to drop: single ones, ``share`` of all, and bursts of 20 to 150 ms. The ends stay."""
+    dropped = rng.random(len(stamps_ns)) < share
+    for start in rng.uniform(stamps_ns[0], stamps_ns[-1], bursts):
+        dropped |= (stamps_ns >= start) & (stamps_ns < start + rng.uniform(0.02, 0.15) * NANOSECONDS)
+    dropped[[0, -1]] = False
+    return dropped
 
 
 MAX_YAW_RATE = 0.5  # rad/s
@@ -149,26 +171,24 @@ def drive(seed: int, start_s: float, end_s: float, style: DriveStyle) -> Motion:
     count = max(int(np.ceil((end_s - start_s) / KNOT_SECONDS)) + 1, 6)
     times = np.asarray(start_s + KNOT_SECONDS * np.arange(count), np.float64)
 
-    def wander(period_s: float) -> FloatArray:
-        return _wander(rng, count, period_s / KNOT_SECONDS)
+    def wandering(period_s: float) -> FloatArray:
+        return wander(rng, count, period_s / KNOT_SECONDS)
 
-    speed = np.maximum(style.speed_mps + style.speed_change_mps * wander(8.0), 0.0)
+    speed = np.maximum(style.speed_mps + style.speed_change_mps * wandering(8.0), 0.0)
     speed = gaussian_filter1d(speed, 0.3 / KNOT_SECONDS, mode="nearest")  # stopping and starting takes time
     limit = np.minimum(MAX_YAW_RATE, MAX_LATERAL_ACCELERATION / np.maximum(speed, 1e-3))
     grip = np.minimum(speed / 2.0, 1.0)  # a standing car does not turn
-    yaw_rate = grip * limit * np.tanh(style.yaw_rate * wander(6.0) / limit)
-    distance = _integral(speed)
-    hills = _wander(rng, int(distance[-1]) + 2, HILL_METRES)  # metre by metre
+    yaw_rate = grip * limit * np.tanh(style.yaw_rate * wandering(6.0) / limit)
+    distance = integral(speed)
+    hills = wander(rng, int(distance[-1]) + 2, HILL_METRES)  # metre by metre
     gradient = style.slope * np.interp(distance, np.arange(len(hills)), hills)
 
-    yaw = _integral(yaw_rate)
-    axle = np.column_stack(
-        [_integral(speed * np.cos(yaw)), _integral(speed * np.sin(yaw)), _integral(speed * gradient)]
-    )
+    yaw = integral(yaw_rate)
+    axle = np.column_stack([integral(speed * np.cos(yaw)), integral(speed * np.sin(yaw)), integral(speed * gradient)])
 
     liveliness = style.shake * np.minimum(0.15 + speed / 8.0, 1.5)
     pitch, roll, heave = (
-        liveliness * (slow * wander(1.6) + fast * wander(0.6))
+        liveliness * (slow * wandering(1.6) + fast * wandering(0.6))
         for slow, fast in ((0.006, 0.002), (0.007, 0.002), (0.012, 0.003))
     )
     dive = 0.003 * np.gradient(speed, KNOT_SECONDS)
@@ -182,7 +202,7 @@ def drive(seed: int, start_s: float, end_s: float, style: DriveStyle) -> Motion:
     return Motion(times, RigidTransform.from_components(positions, body * mounting * ROTATION_WORLD_CAMERA_LEVEL))
 
 
-def _wander(rng: np.random.Generator, count: int, period: float) -> FloatArray:
+def wander(rng: np.random.Generator, count: int, period: float) -> FloatArray:
     """A smooth random signal (count,) of unit variance, whose features last about ``period`` steps."""
     sigma = 0.25 * period
     margin = int(4 * sigma) + 1
@@ -191,6 +211,6 @@ def _wander(rng: np.random.Generator, count: int, period: float) -> FloatArray:
     return np.asarray(smooth * np.sqrt(2.0 * np.sqrt(np.pi) * sigma), np.float64)
 
 
-def _integral(rate: FloatArray) -> FloatArray:
+def integral(rate: FloatArray) -> FloatArray:
     """The integral from the first knot, by trapezoids."""
     return np.concatenate([[0.0], np.cumsum(0.5 * KNOT_SECONDS * (rate[1:] + rate[:-1]))])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -29,6 +30,8 @@ CROSSING_METRES = 12.0  # passages this close to each other share the ground
 LOT_METRES = 13.0  # along the street: one house or garden a side
 HOUSE_CLEARANCE = 3.0  # metres from the camera's path
 THING_CLEARANCE = 1.7
+KERB_METRES = 0.18  # across
+KERB_RUN_METRES = LOT_METRES / 2
 
 # A box of unit size on the ground: its four walls and its lid, (5, 4, 3), counter-clockwise from outside.
 _RIM = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
@@ -47,7 +50,7 @@ class Look:
 
     Widths are metres from the path (the camera drives in the right lane). sun (3,) points to the
     sun; ambient is the light in the shade as a share of full light; houses, cars and plants are
-    probabilities; sky is its radiance.
+    probabilities; sky is its radiance; kerb_m is the height of the step beside the road, 0 where there is none.
     """
 
     road_left_m: float
@@ -60,6 +63,12 @@ class Look:
     plants: float
     markings: bool
     sky: float
+    kerb_m: float
+
+    @staticmethod
+    def of_world(seed: int) -> Look:
+        """The look of the world of a seed."""
+        return Look.draw(np.random.default_rng([seed, 1]))
 
     @staticmethod
     def draw(rng: np.random.Generator) -> Look:
@@ -77,7 +86,8 @@ class Look:
             cars=rng.uniform(0.1, 0.7),
             plants=rng.uniform(0.3, 1.0),
             markings=bool(rng.random() < 0.6),
-            sky=rng.uniform(0.65, 1.1),
+            sky=rng.uniform(0.3, 1.1),
+            kerb_m=rng.choice([0.0, rng.uniform(0.05, 0.16)], p=[0.3, 0.7]),
         )
 
 
@@ -89,8 +99,11 @@ class Route:
     straight beyond both ends.
     """
 
-    def __init__(self, poses: RigidTransform, camera_height_m: float) -> None:
-        """poses: T_world_camera (z up) in order of time, close enough to interpolate; standing still is fine."""
+    def __init__(self, poses: RigidTransform, camera_height_m: float, beside: FloatArray | None = None) -> None:
+        """poses: T_world_camera (z up) in order of time, close enough to interpolate; standing still is fine.
+
+        beside: points (M, 2) off the path that are kept clear as the path is: of a camera that does not follow it.
+        """
         ground = poses.translation - [0.0, 0.0, camera_height_m]
         ground = ground[_apart(ground[:, :2], STATION_METRES)]
         headings = poses.rotation[[0, -1]].apply([0.0, 0.0, 1.0])[:, :2]
@@ -108,6 +121,8 @@ class Route:
         self.tangents = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
         self.normals = np.column_stack([-self.tangents[:, 1], self.tangents[:, 0]])
         self.tree = cKDTree(self.points)
+        self._clear = self.points if beside is None else np.concatenate([self.points, beside])
+        self._clear_tree = cKDTree(self._clear)
         self.is_new = self._find_new()
         # Heights come from where the camera was; the roads beyond are as high as what is near them.
         measured = np.arange(along[1], along[-2] + HEIGHT_METRES, HEIGHT_METRES)
@@ -145,10 +160,10 @@ class Route:
         centre (2,), axes (2, 2) unit rows, half (2,) its half lengths along them.
         """
         radius = float(np.hypot(*half)) + margin
-        nearest, _ = self.tree.query(centre)
+        nearest, _ = self._clear_tree.query(centre)
         if nearest > radius:
             return True
-        near = self.points[self.tree.query_ball_point(centre, radius)]
+        near = self._clear[self._clear_tree.query_ball_point(centre, radius)]
         outside = np.maximum(np.abs((near - centre) @ axes.T) - half, 0.0)
         return bool(np.hypot(*outside.T).min() > margin)
 
@@ -183,6 +198,10 @@ class Polygons:
     def joined(parts: Sequence[Polygons]) -> Polygons:
         """All polygons of the parts."""
         return Polygons(*(np.concatenate([getattr(p, name) for p in parts]) for name in Polygons.__slots__))
+
+    def take(self, indices: NDArray[np.int64]) -> Polygons:
+        """Some of the polygons."""
+        return Polygons(*(getattr(self, name)[indices] for name in Polygons.__slots__))
 
 
 MAX_CORNERS = 5
@@ -263,27 +282,37 @@ def _tint(rng: np.random.Generator, low: float, high: float, colour: float) -> F
     return np.asarray(np.exp(rng.uniform(np.log(low), np.log(high)) + colour * rng.standard_normal(3)))
 
 
+class Ground(Protocol):
+    """Where things can be placed."""
+
+    def is_clear(self, centre: FloatArray, axes: FloatArray, half: FloatArray, margin: float) -> bool:
+        """Whether a rectangle is free, see ``Route.is_clear``."""
+
+    def height(self, points: FloatArray) -> FloatArray:
+        """Height (N,) at points (N, 2)."""
+
+
 class _Site:
     """A place on the ground with a heading: turns local coordinates (x along, y left, z up) into the world's."""
 
-    def __init__(self, route: Route, centre: FloatArray, heading: float) -> None:
-        self._route, self.centre = route, centre
+    def __init__(self, ground: Ground, centre: FloatArray, heading: float) -> None:
+        self._ground, self.centre = ground, centre
         c, s = np.cos(heading), np.sin(heading)
         self.axes = np.array([[c, s], [-s, c]])
 
     def is_clear(self, length: float, width: float, margin: float) -> bool:
         """Whether a rectangle here keeps its distance from everywhere the camera passes."""
-        return self._route.is_clear(self.centre, self.axes, 0.5 * np.array([length, width]), margin)
+        return self._ground.is_clear(self.centre, self.axes, 0.5 * np.array([length, width]), margin)
 
     def settle(self) -> None:
         """Finds the ground; to be called before ``points``."""
-        self._ground = float(self._route.height(self.centre[None])[0])
+        self._height = float(self._ground.height(self.centre[None])[0])
 
     def points(self, local: FloatArray) -> FloatArray:
         """Local points (..., 3) in the world."""
         world = np.empty(local.shape)
         world[..., :2] = local[..., :2] @ self.axes + self.centre
-        world[..., 2] = local[..., 2] + self._ground
+        world[..., 2] = local[..., 2] + self._height
         return world
 
     def outline(self, local: FloatArray) -> FloatArray:
@@ -294,8 +323,8 @@ class _Site:
 class Builder:
     """Places things; every one leaves polygons, and the outline of its shadow on the ground."""
 
-    def __init__(self, route: Route, look: Look) -> None:
-        self._route, self._look = route, look
+    def __init__(self, ground: Ground, look: Look) -> None:
+        self._ground, self._look = ground, look
         self._collector = _Collector()
         self.shadows: list[FloatArray] = []
 
@@ -331,7 +360,7 @@ class Builder:
 
     def house(self, rng: np.random.Generator, centre: FloatArray, heading: float, length: float) -> None:
         """A house with a pitched or flat roof."""
-        site = _Site(self._route, centre, heading)
+        site = _Site(self._ground, centre, heading)
         depth, height = rng.uniform(7.0, 12.0), rng.uniform(3.2, 10.0)
         if not site.is_clear(length, depth, HOUSE_CLEARANCE):
             return
@@ -345,6 +374,27 @@ class Builder:
         else:
             self._gable(rng, site, (length, depth, height), surface, tint, shift, scale)
         self._shadow(site.outline(_RIM * [length, depth]), height + 1.0)
+        if rng.random() < 0.6:
+            self._annexes(rng, site, (length, depth, height), surface, tint)
+
+    def _annexes(
+        self, rng: np.random.Generator, site: _Site, size: tuple[float, float, float], surface: int, tint: FloatArray
+    ) -> None:
+        """What stands out of both fronts: balconies, bay windows, porches."""
+        length, depth, height = size
+        for _ in range(int(rng.integers(1, 4))):
+            wide, out = rng.uniform(1.2, 3.5), rng.uniform(0.3, 1.2)
+            along = rng.uniform(-0.5, 0.5) * (length - wide)
+            low, high = ((2.8, 3.8), (5.7, 6.7), (-0.7, min(height, 3.0)), (-0.7, 0.5))[rng.integers(4)]
+            if high > height:
+                continue
+            box = (wide, depth + 2 * out, high - low)
+            shift, look = rng.uniform(0, TILE_METRES), tint * rng.uniform(0.7, 1.2)
+            self._boxes(site, (RIGHT, LEFT), box, (along, 0, low), surface, look, shift)
+            sides = np.array([[along, side * 0.5 * (depth + out), low] for side in (-1, -1, 1, 1)])
+            flanks = (FRONT, BACK, FRONT, BACK)
+            self._boxes(site, flanks, (wide, out, high - low), sides, Surface.PLAIN, look, shift)
+            self._boxes(site, (TOP,), box, (along, 0, low), Surface.STONE, look, shift)
 
     def _gable(
         self,
@@ -370,7 +420,7 @@ class Builder:
 
     def car(self, rng: np.random.Generator, centre: FloatArray, heading: float) -> None:
         """A car or van: body, cabin, shadowed underside, wheels, lights and number plates."""
-        site = _Site(self._route, centre, heading)
+        site = _Site(self._ground, centre, heading)
         if rng.random() < 0.2:  # a van
             length, width, waist, roof = rng.uniform(4.6, 5.6), 1.95, 1.2, 2.1
             cabin, back = 0.9 * length, 0.0
@@ -399,9 +449,31 @@ class Builder:
         self._boxes(site, (FRONT, BACK), (length + 0.02, 0.52, 0.12), (0, 0, 0.4), Surface.PLAIN, white)
         self._shadow(site.outline(_RIM * [length, width]), 0.7 * roof)
 
+    def person(self, rng: np.random.Generator, centre: FloatArray, heading: float) -> None:
+        """Somebody on foot: legs, body, head."""
+        site = _Site(self._ground, centre, heading)
+        if not site.is_clear(0.4, 0.5, THING_CLEARANCE):
+            return
+        site.settle()
+        tall, shift = rng.uniform(1.5, 1.95), rng.uniform(0, TILE_METRES)
+        legs, shirt, skin = _tint(rng, 0.1, 0.8, 0.1), _tint(rng, 0.1, 1.5, 0.3), np.array([1.2, 0.95, 0.8])
+        self._boxes(site, WALLS, (0.25, 0.32, 0.5 * tall), (0, 0, 0), Surface.PAINT, legs, shift)
+        self._boxes(site, BOX, (0.28, 0.48, 0.36 * tall), (0, 0, 0.5 * tall), Surface.PAINT, shirt, shift)
+        self._boxes(site, BOX, (0.2, 0.17, 0.14 * tall), (0, 0, 0.86 * tall), Surface.PLAIN, skin, shift)
+        self._shadow(site.outline(_RIM * 0.4), tall)
+
+    def kerb(self, rng: np.random.Generator, centre: FloatArray, heading: float, length: float) -> None:
+        """A row of kerbstones, a step of some 10 cm."""
+        site = _Site(self._ground, centre, heading)
+        if not site.is_clear(length, KERB_METRES, THING_CLEARANCE):
+            return
+        site.settle()
+        size, tint = (length, KERB_METRES, self._look.kerb_m + 0.3), np.full(3, 1.15)
+        self._boxes(site, (RIGHT, LEFT, TOP), size, (0, 0, -0.3), Surface.STONE, tint, rng.uniform(0, TILE_METRES))
+
     def hedge(self, rng: np.random.Generator, centre: FloatArray, heading: float, length: float) -> None:
         """A hedge, a garden wall or a fence."""
-        site = _Site(self._route, centre, heading)
+        site = _Site(self._ground, centre, heading)
         kind = int(rng.choice(3, p=[0.5, 0.25, 0.25]))
         surface = (Surface.FOLIAGE, Surface.STONE, Surface.FENCE)[kind]
         thickness, height = (rng.uniform(0.5, 1.0), 0.25, 0.06)[kind], rng.uniform(0.7, 1.9)
@@ -429,7 +501,7 @@ class Builder:
 
     def _crown(self, rng: np.random.Generator, centre: FloatArray, height: float, radii: FloatArray) -> None:
         """Leaves: a dodecahedron stretched to the radii (3,), its middle ``height`` above the ground."""
-        site = _Site(self._route, centre, rng.uniform(0, 2 * np.pi))
+        site = _Site(self._ground, centre, rng.uniform(0, 2 * np.pi))
         if not site.is_clear(2 * radii[0], 2 * radii[1], THING_CLEARANCE):
             return
         site.settle()
@@ -452,7 +524,7 @@ class Builder:
         self, rng: np.random.Generator, centre: FloatArray, girth: float, height: float, surface: int, tint: FloatArray
     ) -> _Site | None:
         """Something upright and thin; None where it would be in the way."""
-        site = _Site(self._route, centre, rng.uniform(0, 2 * np.pi))
+        site = _Site(self._ground, centre, rng.uniform(0, 2 * np.pi))
         if not site.is_clear(girth, girth, THING_CLEARANCE):
             return None
         site.settle()
@@ -508,3 +580,9 @@ def _furnish(builder: Builder, rng: np.random.Generator, route: Route, look: Loo
             builder.car(rng, spot(along, max(kerb - rng.uniform(-0.6, 1.0), 2.8)), turned)
     if rng.random() < 0.5:
         builder.pole(rng, spot(rng.uniform(0, LOT_METRES), kerb + 0.5))
+    if look.kerb_m > 0:
+        for start in np.arange(0.0, LOT_METRES, KERB_RUN_METRES):
+            if rng.random() < 0.85:  # else it is lowered, as before a driveway
+                builder.kerb(
+                    rng, spot(start + 0.5 * KERB_RUN_METRES, kerb + 0.5 * KERB_METRES), heading, KERB_RUN_METRES
+                )

@@ -100,7 +100,7 @@ def _bars(pitch_m: float, share: float) -> Float32:
 
 def _facade(rng: np.random.Generator) -> Float32:
     """A house front: plaster or brick, a plinth, windows floor by floor, doors. Row 0 is the ground."""
-    wall = noise(rng, (4, 16, 64, 256), (0.03, 0.02, 0.015, 0.02)) + rng.uniform(0.45, 0.95)
+    wall = noise(rng, (4, 16, 64, 128, 256), (0.03, 0.02, 0.02, 0.02, 0.03)) + rng.uniform(0.45, 0.95)
     if rng.random() < 0.3:
         wall = wall * 0.7 + _blocks(rng, 0.4, 0.15, 0.08, 0.05)
     bays = int(rng.integers(3, 6))
@@ -115,7 +115,7 @@ def _facade(rng: np.random.Generator) -> Float32:
     shutters = rng.random() < 0.3
     for bottom in range(0, TILE_TEXELS - sill - height, floor_texels):
         for bay in range(bays):
-            if rng.random() < 0.15:
+            if rng.random() < 0.1:
                 continue
             left = int((bay + rng.uniform(0.25, 0.35)) * TILE_TEXELS / bays)
             low, high = bottom + sill, bottom + sill + height
@@ -139,12 +139,12 @@ def _tiles() -> list[Float32]:
     """The albedo of every surface, in the order of ``Surface``; values are clipped to 0..1 later."""
     rng = np.random.default_rng(LIBRARY_SEED)
     octaves = (4, 8, 16, 32, 64, 128, 256)
-    asphalt = 0.42 + noise(rng, octaves, (0.02, 0.025, 0.02, 0.02, 0.02, 0.03, 0.05))
+    asphalt = 0.42 + noise(rng, octaves, (0.015, 0.015, 0.01, 0.012, 0.015, 0.025, 0.045))
     seams = np.abs(noise(rng, (3, 8, 32), (1.0, 0.4, 0.1)))  # tar lines follow the zeros of a smooth field
     asphalt -= 0.16 * (seams < 0.02)
     paving = 0.62 + _blocks(rng, 0.5, 0.32, 0.18, 0.05) + noise(rng, octaves, (0.03,) * 7)
     grass = 0.36 + noise(rng, octaves, (0.03, 0.03, 0.04, 0.05, 0.06, 0.08, 0.08))
-    foliage = 0.30 + noise(rng, octaves[2:], (0.06, 0.10, 0.12, 0.12, 0.08))
+    foliage = 0.32 + noise(rng, octaves[2:], (0.08, 0.13, 0.15, 0.13, 0.10))
     roof = 0.38 + _blocks(rng, 0.3, 0.35, 0.15, 0.05) + noise(rng, octaves[:4], (0.03,) * 4)
     stone = 0.50 + _blocks(rng, 0.6, 0.4, 0.2, 0.09) + noise(rng, octaves, (0.03,) * 7)
     paint = 0.60 + noise(rng, octaves[1:4], (0.03, 0.05, 0.04))

@@ -7,6 +7,8 @@ each edge. Both are affine in (u, v), so the cast is exact and needs no clipping
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from fusion_io.records import FloatArray
 from fusion_io.simulation.ground import CELL_METRES, GroundMap, build_ground
 from fusion_io.simulation.street import Look, Polygons, Route, build_street
 from fusion_io.simulation.textures import COLOURS, Float32, Surface, library
+from fusion_io.simulation.traffic import Mover
 
 VIEW_METRES = 120.0  # nothing further away is drawn
 INDEX_METRES = 32.0
@@ -24,11 +27,12 @@ TENT = np.array([0.25, 0.5, 0.25], np.float32)  # the pixel's filter over sample
 
 
 class World:
-    """A street along a path, fixed by seed and place."""
+    """A street along a path, fixed by seed and place, and what moves on it."""
 
-    def __init__(self, seed: int, route: Route, look: Look | None = None) -> None:
-        """route: where the camera passes; look: drawn from the seed unless given."""
-        self.look = look or Look.draw(np.random.default_rng([seed, 1]))
+    def __init__(self, seed: int, route: Route, look: Look | None = None, movers: Sequence[Mover] = ()) -> None:
+        """route: where the camera passes; look: ``Look.of_world(seed)`` unless given."""
+        self.look = look or Look.of_world(seed)
+        self._movers = movers
         self._offset = np.random.default_rng([seed, 2]).uniform(0, 100, 2).astype(np.float32)
         self._tones = np.exp(np.random.default_rng([seed, 3]).normal(0, 0.2, 3)).astype(np.float32)
         street, shadows = build_street(route, self.look, seed)
@@ -37,14 +41,22 @@ class World:
         self._index = _index_by_place(self._polygons)
 
     def render(
-        self, T_world_camera: FloatArray, K: FloatArray, width: int, height: int, colour: bool = False
+        self,
+        T_world_camera: FloatArray,
+        K: FloatArray,
+        width: int,
+        height: int,
+        colour: bool = False,
+        time_s: float = 0.0,
     ) -> tuple[Float32, Float32]:
-        """The scene from a pose (4, 4) through a pinhole camera K (3, 3), pixel centres at integers.
+        """The scene at a time from a pose (4, 4) through a pinhole camera K (3, 3), pixel centres at integers.
 
         Returns the radiance (H, W) or (H, W, 3), where 1 is white and more is possible, and the
         exact depth (H, W) in metres along the optical axis at the pixels' centres, 0 for the sky.
         """
-        view = _View(self._polygons, self._nearby(T_world_camera), T_world_camera, K, width, height)
+        near = self._polygons.take(self._nearby(T_world_camera))
+        moving = [mover.at(time_s) for mover in self._movers]
+        view = _View(Polygons.joined([near, *moving]), T_world_camera, K, width, height)
         # Samples lie every half pixel, pixel centres among them, with a margin of one sample.
         fine = K.copy()
         fine[:2] *= 2.0
@@ -80,7 +92,7 @@ class World:
         u, v = view.texture_coordinates(K, width, pixels, polygon, inverse)
         # The footprint of a sample is z/f across the view and longer by the slant 1/cos along it. A
         # value between the two, nearer the long one, blurs little and leaves little to alias.
-        across = -np.log2(inverse) - np.float32(np.log2(K[0, 0]))
+        across = -np.log2(inverse) - np.float32(_log_focal(K))
         slant = _log_ray_lengths(K, width, height)[pixels] - view.log_distances[polygon] - np.log2(inverse)
         light = (view.tints if colour else view.grey_tints)[polygon]
         surface = view.surfaces[polygon]
@@ -109,7 +121,7 @@ class World:
         surface[on_road] = Surface.ASPHALT
         tone = self._tones[surface]
         x, y = (x + self._offset[0]) * np.float32(0.25), (y + self._offset[1]) * np.float32(0.25)
-        tone *= 0.5 + library().lookup(PATCHES, x, y, across + slant - 2)
+        tone *= 0.75 + 0.5 * library().lookup(PATCHES, x, y, across + slant - 2)
         width, length = np.exp2(across), np.exp2(across + slant)
         paint = _stripe(lateral - look.road_left_m, 0.07, width) + _stripe(lateral + look.road_right_m, 0.07, width)
         paint *= 0.8  # kerbstones
@@ -135,15 +147,10 @@ class World:
         return np.asarray(haze + np.clip(up / 0.02 + 0.5, 0.0, 1.0) * (sky - haze), np.float32)
 
 
-def exposure(radiance: Float32) -> float:
-    """The gain that an automatic exposure picks: the median goes a bit below mid grey."""
-    return 0.42 / float(np.median(radiance))
-
-
-def exposed(radiance: Float32, gain: float, error: Float32 | float = 0.0) -> NDArray[np.uint8]:
-    """The image of a radiance: a linear sensor that saturates. error is in grey levels."""
-    levels = np.rint(radiance * np.float32(255.0 * gain) + error)
-    return np.asarray(np.clip(levels, 0, 255), np.uint8)
+def _log_focal(K: FloatArray) -> float:
+    """log2 of the focal length that says how far apart samples are; of unequal ones nearer the shorter."""
+    short, long = sorted([K[0, 0], K[1, 1]])
+    return float(SLANT_SHARE * np.log2(short) + (1.0 - SLANT_SHARE) * np.log2(long))
 
 
 def _rays(K: FloatArray, width: int, pixels: NDArray[np.int64]) -> Float32:
@@ -166,18 +173,17 @@ class _View:
     def __init__(
         self,
         polygons: Polygons,
-        candidates: NDArray[np.int64],
         T_world_camera: FloatArray,
         K: FloatArray,
         width: int,
         height: int,
     ) -> None:
         self.rotation, self.position = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        first = polygons.corners[candidates, 0] - self.position
-        facing = np.einsum("ij,ij->i", polygons.normals[candidates], first) < -1e-6
+        first = polygons.corners[:, 0] - self.position
+        facing = np.einsum("ij,ij->i", polygons.normals, first) < -1e-6
         facing &= np.einsum("ij,ij->i", first, first) < VIEW_METRES**2
         facing &= first @ self.rotation[:, 2] > -2 * CELL_METRES
-        candidates = candidates[facing]
+        candidates = np.flatnonzero(facing)
         corners = (polygons.corners[candidates] - self.position) @ self.rotation
         # A polygon is out of sight if all its corners are outside of one side of the view's pyramid.
         sides = np.array([[1, 0, 1], [-1, 0, width], [0, 1, 1], [0, -1, height], [0, 0, 1]]) @ K
