@@ -24,6 +24,10 @@ types: $(STAMP)
 
 bench: $(STAMP)
 	$(PY) benchmarks/memory.py
+	$(PY) benchmarks/speed.py
+	$(PY) benchmarks/simulator.py
+	$(PY) benchmarks/claims.py
+	$(PY) benchmarks/covariance.py
 
 # The stamp is older than these files when the installation no longer matches them.
 $(STAMP): pyproject.toml constraints.txt

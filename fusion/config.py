@@ -45,11 +45,14 @@ class FrontendConfig(Section):
     """Where the pair estimates come from.
 
     auto: those recorded in the log if it has any, otherwise the network. weights: a checkpoint of the network, or
-    None for the one that ships with the package.
+    None for the one that ships with the package. adapt: whether the network is first adapted to the log's images.
+    refine: whether its estimates are refined to the photometric optimum at full resolution.
     """
 
     mode: FrontendMode = "auto"
     weights: Path | None = None
+    adapt: bool = False
+    refine: bool = True
 
 
 class ImuConfig(Section):

@@ -55,7 +55,7 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
     findings = Findings()
     stopwatch.lap("read")
 
-    pairs = pair_estimates(log, samples, config.frontend, findings)
+    pairs = pair_estimates(log, samples, config.frontend, findings, folder)
     stopwatch.lap("pairs")
 
     calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
@@ -91,11 +91,13 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
     return exit_code(outcome)
 
 
-def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: Findings) -> list[PairEstimate]:
+def pair_estimates(
+    log: Log, imu: ImuSeries, config: FrontendConfig, findings: Findings, folder: Path
+) -> list[PairEstimate]:
     """The recorded pair estimates of the log or those of the network, as they read back from their message.
 
     Passing the network's estimates through their message makes a replay of the output start from the same bits.
-    Raises LogError where there are none.
+    A network that is adapted to the log first is left in the folder. Raises LogError where there are none.
     """
     if config.mode == "recorded" or (config.mode == "auto" and log.has_pairs):
         pairs = log.pairs()
@@ -108,9 +110,10 @@ def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: F
     from fusion_io.progress import track
     from learned.estimator import estimate_pairs
 
+    weights = adapted_weights(log, config, folder) if config.adapt else config.weights
     skipped: Counter[str] = Counter()
     frames = track(log.frames(), "pair estimates", len(log.frame_stamps()))
-    estimates = estimate_pairs(log, imu, config.weights, frames, skipped)
+    estimates = estimate_pairs(log, imu, weights, frames, skipped, config.refine)
     pairs = [decode_pair(encode_pair(pair)) for pair in estimates]
     for name, count in skipped.items():
         findings.put(name, count, f"{name.replace('_', ' ')}: {count}")
@@ -118,6 +121,15 @@ def pair_estimates(log: Log, imu: ImuSeries, config: FrontendConfig, findings: F
         reasons = "; ".join(findings.notes) or f"it has {len(log.frame_stamps())} frames"
         raise LogError(f"{log.path}: no pair of frames could be estimated ({reasons})")
     return pairs
+
+
+def adapted_weights(log: Log, config: FrontendConfig, folder: Path) -> Path:
+    """The weights after adaptation to the log, in the folder; says on stderr what it was good for."""
+    from learned.adapt import adapt
+
+    path = folder / "adapted.pt"
+    print(adapt(log, config.weights, path), file=sys.stderr)
+    return path
 
 
 def known_mounting(log: Log, config: ImuConfig) -> Rotation | None:
@@ -232,6 +244,14 @@ def _parser() -> argparse.ArgumentParser:
         help="where pair estimates come from (default: auto, those in the log if it has any, else the network)",
     )
     parser.add_argument("--weights", type=Path, metavar="FILE", help="the network's weights (default: those shipped)")
+    parser.add_argument(
+        "--adapt", action="store_true", default=None, help="adapt the network to the log's images first (minutes)"
+    )
+    parser.add_argument(
+        "--refine",
+        action=argparse.BooleanOptionalAction,
+        help="refine the network's estimates at full resolution (default: yes)",
+    )
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings; the options here come before it")
     parser.add_argument(
         "--segment-lengths",
@@ -277,7 +297,9 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
         "segment_lengths_m": arguments.segment_lengths,
         "topics": dict(arguments.topic) if arguments.topic else None,
     }
-    frontend = {"mode": arguments.frontend, "weights": arguments.weights}
+    frontend = {name: getattr(arguments, name) for name in ("weights", "adapt", "refine")} | {
+        "mode": arguments.frontend
+    }
     return _given(options) | {"frontend": _given(frontend)}
 
 

@@ -24,7 +24,10 @@ HOLE_PERIODS = 5
 """Samples further apart than this many median periods have a hole between them."""
 
 MIN_VALID_SHARE = 0.25
-"""A pixel of the network has depth if at least this share of the pixels it covers has."""
+"""A pixel of the network has depth if the pixels it covers have it at least this often, relative to the whole image.
+
+Relative, because a scanner leaves most pixels empty everywhere, stereo only where it fails.
+"""
 
 
 @dataclass(frozen=True)
@@ -66,11 +69,12 @@ def to_channels(image: NDArray[np.uint8], channels: int) -> NDArray[np.uint8]:
 
 def resize_depth(depth: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Depth (H, W) m at another size by averaging valid inverse depths; 0 where too few are valid."""
-    valid = np.isfinite(depth) & (depth > 0)
-    inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
-    share = cv2.resize(valid.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    valid = (depth > 0) & (depth < np.inf)  # false for NaN as well
+    known = valid.astype(np.float32)
+    inverse = known / np.where(valid, depth, np.float32(1))
+    share = cv2.resize(known, (width, height), interpolation=cv2.INTER_AREA)
     mean_inverse = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_AREA)
-    enough = (share >= MIN_VALID_SHARE) & (mean_inverse > 0)
+    enough = (share >= MIN_VALID_SHARE * np.count_nonzero(valid) / valid.size) & (mean_inverse > 0)
     return np.where(enough, share / np.where(enough, mean_inverse, 1), 0).astype(np.float32)
 
 

@@ -1,48 +1,64 @@
 """Train VIOLearner without labels: `python -m learned.train --preset fast --out DIR`.
 
-Everything lands in DIR: rendered pairs (data/), the state to resume from (checkpoint.pt), the curve (curve.csv),
-and at the end the weights with their fitted covariance (PRESET.pt). Run the same command again to go on after an
-interruption: batches are a function of seed and step, so the curve is the same as without it.
+Everything lands in DIR: what it was begun with (run.json), the pairs (data/), the state to resume from
+(checkpoint.pt), the curve (curve.csv, curve.png), a picture at every validation (pictures/), and at the end the
+weights with their fitted covariance (PRESET.pt). Run the same command again to go on after an interruption: batches
+are a function of seed and step, so the curve is the same as without it.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
+import json
 import math
+import os
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from fusion_io.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import torch
-
-    from learned.dataset import Pairs
+    from learned.dataset import PairSet
+    from learned.optimisation import Descent
     from learned.violearner import VIOLearner
+    from learned.weights import Weights
+
+EXIT_INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
 
 @dataclass(frozen=True)
 class Recipe:
     """How a preset is trained.
 
-    Learning rate, momenta and batch of `paper` are the paper's (section "Training Procedures");
-    its decay interval and lambda are not given there: gamma 0.5 every 20,000 steps and 1e-5 are our choice.
+    Learning rate, momenta, batch, gamma 0.5 and validation every 500 steps of `paper` are the paper's (section
+    "Training Procedures"); its decay interval and lambda are not given there: 20,000 steps and 1e-5 are our choice.
     """
 
     steps: int = 4000
     batch: int = 16
     learning_rate: float = 1e-3
-    schedule: str = "cosine"
+    schedule: Literal["cosine", "exponential"] = "cosine"
     bias_penalty: float = 1e-5
     gradient_norm: float = 1.0
-    clips: int = 640
+    clips: int = 1280
     frames_a_clip: int = 9
     validation_share: float = 0.05
     validate_every: int = 250
     imu_dropout: float = 0.1
     calibration_clips: int = 128
+    refined_calibration_clips: int = 64
+
+    def descent(self) -> Descent:
+        """The part of it that the optimiser needs."""
+        from learned.optimisation import Descent
+
+        return Descent(
+            self.steps, self.batch, self.learning_rate, self.schedule,
+            bias_penalty=self.bias_penalty, gradient_norm=self.gradient_norm, imu_dropout=self.imu_dropout,
+        )  # fmt: skip
 
 
 RECIPES = {
@@ -53,237 +69,278 @@ RECIPES = {
     ),
 }  # fmt: skip
 
-MOMENTA = (0.9, 0.99)
-WARM_UP_STEPS = 100
 CALIBRATION_SEED = 7_000_000
 """Clips of the covariance fit and the final figures: never seen in training or validation."""
 
 
-def main(arguments: list[str] | None = None) -> int:
+DRAWERS = 4
+"""Threads that gather batches while a GPU computes; a CPU has nothing to gain from them."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where pairs come from: a log, or the simulator where `log` is None; `clips` None means the recipe's.
+
+    A pair of a source with weight 2 is drawn twice as often as one with weight 1.
+    """
+
+    log: Path | None = None
+    clips: int | None = None
+    weight: float = 1.0
+
+    def identity(self) -> dict[str, Any]:
+        """What tells it from another, without reading it. Raises LogError for a log that does not exist."""
+        if self.log is None:
+            return {"sim": self.clips, "weight": self.weight}
+        try:
+            return {"log": self.log.name, "bytes": self.log.stat().st_size, "weight": self.weight}
+        except OSError as error:
+            raise LogError(f"{self.log}: {error.strerror}") from None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m learned.train", description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m learned.train",
+        description=__doc__.split("\n\n")[0],
+        epilog="Exit codes: 0 all well, 1 nothing could be computed, 2 usage, 130 interrupted (run again to go on).",
+    )
     parser.add_argument("--preset", choices=sorted(RECIPES), default="fast")
     parser.add_argument("--out", type=Path, required=True, help="folder for data, checkpoints, curve and weights")
-    parser.add_argument("--steps", type=int, help="number of optimiser steps (default: the preset's)")
-    parser.add_argument("--clips", type=int, help="number of simulated clips to train on (default: the preset's)")
-    parser.add_argument("--batch", type=int, help="pairs a step (default: the preset's)")
+    parser.add_argument(
+        "--data", type=_source, nargs="+", action="extend", metavar="SOURCE[@WEIGHT]",
+        help="sim, sim:CLIPS or an MCAP log with images and depth; several make a mixture, in which a pair of weight 2 "
+        "is drawn twice as often as one of weight 1 (default: sim)",
+    )  # fmt: skip
+    parser.add_argument("--steps", type=_positive, help="number of optimiser steps (default: the preset's)")
+    parser.add_argument("--batch", type=_positive, help="pairs a step (default: the preset's)")
+    parser.add_argument(
+        "--calibration-clips", type=_positive, help="simulated clips to fit the covariance on (default: the preset's)"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2, help="processes that render (default 2)")
-    parser.add_argument("--threads", type=int, default=0, help="threads of the training itself (default: torch's)")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    parser.add_argument("--workers", type=_positive, help="processes that render (default: one a core)")
+    parser.add_argument("--threads", type=_positive, help="threads of the training itself (default: torch's)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument(
+        "--precision", choices=("auto", "float32", "bf16"), default="auto",
+        help="of the convolutions; geometry is always float32 (default: bf16 on cuda, else float32)",
+    )  # fmt: skip
     options = parser.parse_args(arguments)
 
     from dataclasses import replace
 
-    from fusion_io.errors import EXIT_FAILED, EXIT_OK, FusionError
-
-    changes = {k: getattr(options, k) for k in ("steps", "clips", "batch") if getattr(options, k) is not None}
-    recipe = replace(RECIPES[options.preset], **changes)
+    changes = {"steps": options.steps, "batch": options.batch, "calibration_clips": options.calibration_clips}
+    changes["refined_calibration_clips"] = options.calibration_clips
+    recipe = replace(RECIPES[options.preset], **{name: value for name, value in changes.items() if value})
     try:
-        train(options.preset, recipe, options.out, options.seed, options.workers, options.threads, options.device)
+        train(
+            options.preset, recipe, options.out, options.seed, options.workers, options.threads, options.device,
+            options.data or (Source(),), options.precision,
+        )  # fmt: skip
     except FusionError as error:
         print(f"error: {error}", file=sys.stderr)
-        return EXIT_FAILED
+        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+    except KeyboardInterrupt as interruption:
+        print(f"{str(interruption) or 'interrupted'}; run the same command again to go on", file=sys.stderr)
+        return EXIT_INTERRUPTED
     return EXIT_OK
 
 
-def train(preset: str, recipe: Recipe, out: Path, seed: int, workers: int, threads: int, device: str) -> Path:
-    """Render, train, calibrate; returns the path of the weights."""
+def train(
+    preset: str,
+    recipe: Recipe,
+    out: Path,
+    seed: int = 0,
+    workers: int | None = None,
+    threads: int | None = None,
+    device: str = "auto",
+    data: Sequence[Source] = (Source(),),
+    precision: str = "auto",
+) -> Path:
+    """Gather pairs, train, calibrate; returns the path of the weights.
+
+    Raises UsageError where `out` was begun with other settings, LogError for a log that cannot be trained on,
+    KeyboardInterrupt where the user stops it.
+    """
+    from contextlib import nullcontext
+    from functools import partial
+
     import torch
 
     from learned import weights
+    from learned.optimisation import bfloat16_layers, optimise
     from learned.violearner import PRESETS, VIOLearner
 
+    device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    precision = ("bf16" if device == "cuda" else "float32") if precision == "auto" else precision
+    workers = workers or os.cpu_count() or 1
     if threads:
         torch.set_num_threads(threads)
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    out.mkdir(parents=True, exist_ok=True)
+    if sum(source.log is None for source in data) > 1:
+        raise UsageError("the simulator can be a source only once")
+    begin(out, preset, recipe, seed, data, precision, asdict(PRESETS[preset]))
     torch.manual_seed(seed)
     model = VIOLearner(PRESETS[preset]).to(device)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
-    pairs = render(model, recipe, out, seed, workers)
-    held_out = max(1, round(recipe.validation_share * len(pairs)))
-    training, validation = split(pairs, len(pairs) - held_out)
+    training, validation = gather(data, model, recipe, out / "data", seed, workers)
     standardise_imu(model, training)
-    optimise(model, recipe, training, validation, out, seed, device)
+    with bfloat16_layers(model, device) if precision == "bf16" else nullcontext():
+        optimise(
+            model, recipe.descent(), recipe.validate_every, training, validation, out, seed, device,
+            drawers=min(workers, DRAWERS) if device == "cuda" else 0,
+            observe=partial(draw_validation, out, validation, device),
+        )  # fmt: skip
+    draw_training_curve(out)
 
     calibration = simulated(model, out / "calibration", recipe.calibration_clips, recipe, CALIBRATION_SEED, workers)
-    model.eval()
-    covariance, figures = calibrate(model, calibration, device)
+    calibrated, figures = calibrate(model, calibration, recipe.refined_calibration_clips, device)
     print("held-out simulation: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()), file=sys.stderr)
     path = out / f"{preset}.pt"
-    weights.save(path, model, covariance, {"seed": seed, "recipe": asdict(recipe), "held_out": figures})
+    weights.save(path, calibrated, {"seed": seed, "recipe": asdict(recipe), "held_out": figures})
     return path
 
 
-def render(model: VIOLearner, recipe: Recipe, out: Path, seed: int, workers: int) -> Pairs:
-    """The simulated pairs of a training run; each seed has clips of its own."""
-    return simulated(model, out / "data", recipe.clips, recipe, 1_000_000 * (seed + 1) + 10_000_000, workers)
+def begin(
+    out: Path, preset: str, recipe: Recipe, seed: int, data: Sequence[Source], precision: str, network: dict[str, Any]
+) -> None:
+    """Note in run.json what a folder is begun with, or raise UsageError if it was begun with something else."""
+    run = {
+        "preset": preset, "seed": seed, "precision": precision, "data": [source.identity() for source in data],
+        "recipe": asdict(recipe), "network": network,
+    }  # fmt: skip
+    text = json.dumps(run, indent=2) + "\n"
+    path = out / "run.json"
+    if path.exists():
+        differences = list(differing(json.loads(path.read_text()), json.loads(text)))
+        if differences:
+            raise UsageError(f"{out}: begun with {'; '.join(differences)}: use the same settings, or another --out")
+        return
+    if (out / "checkpoint.pt").exists():
+        raise UsageError(f"{out}: has a checkpoint but no run.json to tell how it was begun: use another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    except OSError as error:
+        raise UsageError(f"{out}: {error.strerror}") from None
 
 
-def simulated(model: VIOLearner, folder: Path, clips: int, recipe: Recipe, first_seed: int, workers: int) -> Pairs:
+def differing(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """What differs between two nested settings, in words."""
+    for name in before | now:
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            yield from differing(old, new, f"{prefix}{name}.")
+        elif old != new:
+            yield f"{prefix}{name} {json.dumps(old)}, not {json.dumps(new)}"
+
+
+def gather(
+    data: Sequence[Source], model: VIOLearner, recipe: Recipe, folder: Path, seed: int, workers: int
+) -> tuple[PairSet, PairSet]:
+    """Training and validation pairs of all sources, rendered or read on the first call.
+
+    Each seed has simulated clips of its own.
+    """
+    from learned.dataset import Pairs, PairSet, log_shards, split
+
+    sets = []
+    for number, source in enumerate(data):
+        if source.log is None:
+            first_seed = 1_000_000 * (seed + 1) + 10_000_000
+            pairs = simulated(model, folder, source.clips or recipe.clips, recipe, first_seed, workers)
+        else:
+            paths = log_shards(source.log, model.config, folder / f"{number}-{source.log.stem}")
+            pairs = PairSet.of(map(Pairs.load, paths))
+        sets.append(split(pairs.weighted(source.weight), recipe.validation_share))
+    training, validation = zip(*sets, strict=True)
+    return PairSet.mixture(training), PairSet.mixture(validation)
+
+
+def simulated(model: VIOLearner, folder: Path, clips: int, recipe: Recipe, first_seed: int, workers: int) -> PairSet:
     """Pairs of simulated clips, rendered into a folder on the first call."""
     from fusion_io.progress import track
-    from learned.dataset import CLIPS_A_SHARD, Pairs, simulate_shards
+    from learned.dataset import CLIPS_A_SHARD, Pairs, PairSet, simulate_shards
 
     shards = simulate_shards(folder, clips, recipe.frames_a_clip, first_seed, model.config, workers)
-    paths = track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD))
-    return Pairs.concatenate(Pairs.load(path) for path in paths)
+    paths = list(track(shards, f"render {clips} clips", -(-clips // CLIPS_A_SHARD)))
+    return PairSet.of(map(Pairs.load, paths))
 
 
-def split(pairs: Pairs, count: int) -> tuple[Pairs, Pairs]:
-    """The first `count` pairs, and the rest (whole clips lie together, so few clips are cut)."""
-    from learned.dataset import select
-
-    return select(pairs, slice(0, count)), select(pairs, slice(count, None))
-
-
-def standardise_imu(model: VIOLearner, pairs: Pairs) -> None:
-    """Set the statistics with which the network standardises its IMU input."""
+def standardise_imu(model: VIOLearner, pairs: PairSet) -> None:
+    """Set the statistics with which the network standardises its IMU input; without any IMU they stay as they are."""
     import numpy as np
     import torch
 
-    samples = pairs.imu.reshape(-1, 6)
-    model.imu_mean.copy_(torch.from_numpy(np.nanmean(samples, axis=0)))
-    model.imu_std.copy_(torch.from_numpy(np.nanstd(samples, axis=0) + 1e-3))
+    samples = pairs.values("imu").reshape(-1, 6)
+    if np.isfinite(samples).any():
+        model.imu_mean.copy_(torch.from_numpy(np.nanmean(samples, axis=0)))
+        model.imu_std.copy_(torch.from_numpy(np.nanstd(samples, axis=0) + 1e-3))
 
 
-def optimise(
-    model: VIOLearner, recipe: Recipe, training: Pairs, validation: Pairs, out: Path, seed: int, device: str
-) -> None:
-    """Run or resume the optimisation; the model ends with the weights that were best on validation."""
-    import torch
+def draw_validation(out: Path, pairs: PairSet, device: str, model: VIOLearner, step: int) -> None:
+    """Draw a few validation pairs as they are estimated after a step."""
+    from learned.pictures import draw_pairs
 
-    from learned.violearner import loss
-
-    out.mkdir(parents=True, exist_ok=True)
-    optimiser = torch.optim.Adam(model.parameters(), recipe.learning_rate, betas=MOMENTA)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(recipe, step))
-    checkpoint = out / "checkpoint.pt"
-    start, best, best_state = 0, math.inf, model.state_dict()
-    if checkpoint.exists():
-        saved = torch.load(checkpoint, map_location=device, weights_only=True)
-        model.load_state_dict(saved["model"])
-        optimiser.load_state_dict(saved["optimiser"])
-        schedule.load_state_dict(saved["schedule"])
-        start, best, best_state = saved["step"], saved["best"], saved["best_state"]
-    for step in range(start, recipe.steps):
-        model.train()
-        estimate = model(draw_batch(training, recipe, seed, step, device))
-        value = loss(estimate, model, recipe.bias_penalty)
-        optimiser.zero_grad()
-        value.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(model.parameters(), recipe.gradient_norm)
-        optimiser.step()
-        schedule.step()
-        done = step + 1
-        if done % recipe.validate_every == 0 or done == recipe.steps:
-            photometric, by_level = validate(model, validation, device)
-            if photometric < best:
-                best, best_state = photometric, {k: v.clone() for k, v in model.state_dict().items()}
-            log_curve(out / "curve.csv", done, float(value.detach()), photometric, by_level)
-            state: dict[str, Any] = {
-                "model": model.state_dict(), "optimiser": optimiser.state_dict(), "schedule": schedule.state_dict(),
-                "step": done, "best": best, "best_state": best_state,
-            }  # fmt: skip
-            torch.save(state, checkpoint.with_suffix(".partial"))
-            checkpoint.with_suffix(".partial").replace(checkpoint)
-    model.load_state_dict(best_state)
+    draw_pairs(out / "pictures" / f"step-{step:06d}.png", model, pairs, device)
 
 
-def learning_rate_factor(recipe: Recipe, step: int) -> float:
-    """Warm-up and cosine decay, or the paper's exponential policy."""
-    if recipe.schedule == "exponential":
-        return float(0.5 ** (step / 20_000))
-    warm = min(1.0, (step + 1) / WARM_UP_STEPS)
-    return warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / recipe.steps)))
-
-
-def draw_batch(pairs: Pairs, recipe: Recipe, seed: int, step: int, device: str) -> Any:
-    """The batch of a step: a function of seed and step alone, so that resuming changes nothing."""
-    import numpy as np
-    import torch
-
-    from learned.dataset import drop_imu, mirror
-
-    rng = np.random.default_rng([seed, step])
-    batch = pairs.batch(rng.choice(len(pairs), recipe.batch, replace=len(pairs) < recipe.batch), device)
-    batch = mirror(batch, torch.from_numpy(rng.random(recipe.batch) < 0.5).to(device))
-    return drop_imu(batch, torch.from_numpy(rng.random(recipe.batch) < recipe.imu_dropout).to(device))
-
-
-def run(model: VIOLearner, pairs: Pairs, device: str, with_imu: bool = True) -> dict[str, np.ndarray[Any, Any]]:
-    """Inference over all pairs: poses (N, 5, 4, 4) after each level, hypotheses (N, 4, 4, 4), error (N,)."""
-    import numpy as np
-    import torch
-
-    from learned.dataset import drop_imu
-
-    parts: dict[str, list[torch.Tensor]] = {"poses": [], "hypotheses": [], "error": []}
-    with torch.inference_mode():
-        for start in range(0, len(pairs), 32):
-            batch = pairs.batch(np.arange(start, min(start + 32, len(pairs))), device)
-            if not with_imu:
-                batch = drop_imu(batch, torch.ones(len(batch), dtype=torch.bool, device=device))
-            estimate = model(batch)
-            parts["poses"].append(model.pose_source_target(torch.stack(estimate.poses, dim=1)))
-            parts["hypotheses"].append(model.pose_source_target(estimate.hypotheses))
-            parts["error"].append(estimate.errors[-1])
-    return {name: torch.cat(values).cpu().numpy() for name, values in parts.items()}
-
-
-def validate(model: VIOLearner, pairs: Pairs, device: str) -> tuple[float, list[float]]:
-    """Photometric error of the last level, which selects, and translation RMSE (m) by level, which only informs."""
+def draw_training_curve(out: Path) -> None:
+    """Draw curve.csv as curve.png."""
     import numpy as np
 
-    from learned.covariance import pose_errors
+    from learned.pictures import draw_curve
 
-    model.eval()
-    result = run(model, pairs, device)
-    by_level = [
-        float(np.sqrt((pose_errors(result["poses"][:, level], pairs.T_source_target)[:, 3:] ** 2).sum(1).mean()))
-        for level in range(5)
-    ]
-    return float(result["error"].mean()), by_level
+    draw_curve(out / "curve.png", np.loadtxt(out / "curve.csv", delimiter=",", skiprows=1, ndmin=2))
 
 
-def calibrate(model: VIOLearner, pairs: Pairs, device: str) -> tuple[Any, dict[str, float]]:
-    """Fit the covariance on the first half of held-out pairs; report its consistency and the errors on the other."""
+def calibrate(model: VIOLearner, pairs: PairSet, refined_clips: int, device: str) -> tuple[Weights, dict[str, float]]:
+    """Fit the covariances on one half of held-out simulation; the network's weights, and the figures on the other half.
+
+    That of the network's winner is fitted on pairs with and without their IMU, that of the refined pose on clips at
+    full resolution.
+    """
     import numpy as np
 
-    from learned.covariance import fit, hypothesis_spread, mean_nees, pose_errors
+    from learned.covariance import UNCALIBRATED, fit, hypothesis_spread, mean_nees, pooled, pose_errors
+    from learned.held_out import fit_refined
+    from learned.optimisation import run
+    from learned.weights import Weights
 
-    sets = {}
-    for with_imu in (True, False):
-        result = run(model, pairs, device, with_imu)
-        errors = pose_errors(result["poses"][:, -1], pairs.T_source_target)
-        sets[with_imu] = errors, hypothesis_spread(result["hypotheses"], result["poses"][:, -1])
-    half = len(pairs) // 2
-    covariance = fit(sets[True][0][:half], sets[True][1][:half], sets[False][0][:half], sets[False][1][:half])
-    errors, spread = sets[True][0][half:], sets[True][1][half:]
-    return covariance, {
-        "translation_rmse_m": float(np.sqrt((errors[:, 3:] ** 2).sum(1).mean())),
-        "rotation_rmse_rad": float(np.sqrt((errors[:, :3] ** 2).sum(1).mean())),
-        "anees": mean_nees(errors, covariance.covariance(spread, np.ones(len(errors)))),
+    true, half = pairs.values("T_source_target"), len(pairs) // 2
+    results = [run(model, pairs, device, with_imu) for with_imu in (True, False)]
+    errors = [pose_errors(result["poses"][:, -1], true) for result in results]
+    spread = [pooled(hypothesis_spread(result["hypotheses"], result["poses"][:, -1])) for result in results]
+    covariance = fit(errors[0][:half], spread[0][:half], errors[1][:half], spread[1][:half])
+    refined_covariance, figures = fit_refined(Weights(model.cpu(), covariance, UNCALIBRATED), refined_clips)
+    rest = errors[0][half:]
+    return Weights(model, covariance, refined_covariance), {
+        "translation_rmse_m": float(np.sqrt((rest[:, 3:] ** 2).sum(1).mean())),
+        "rotation_rmse_rad": float(np.sqrt((rest[:, :3] ** 2).sum(1).mean())),
+        "anees": mean_nees(rest, covariance.covariance(spread[0][half:], np.ones(len(rest)))),
+        **figures,
     }
 
 
-def log_curve(path: Path, step: int, loss: float, photometric: float, by_level: list[float]) -> None:
-    """Append a line to the curve, and show it."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(
-                ["step", "training_loss", "validation_error", *(f"translation_rmse_m_level_{i}" for i in range(5))]
-            )
-        writer.writerow([step, f"{loss:.5f}", f"{photometric:.5f}", *(f"{v:.4f}" for v in by_level)])
-    levels = " ".join(f"{v:.3f}" for v in by_level)
-    print(
-        f"step {step}: loss {loss:.4f}, validation {photometric:.4f}, translation RMSE by level {levels} m",
-        file=sys.stderr,
-    )
+def _source(text: str) -> Source:
+    name, at, number = text.rpartition("@")
+    try:
+        weight = float(number) if at else 1.0
+    except ValueError:  # the @ belongs to the path
+        name, weight = text, 1.0
+    name = name or text
+    if not 0 < weight < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: a weight is positive")
+    kind, colon, clips = name.partition(":")
+    if kind != "sim":
+        return Source(Path(name), weight=weight)
+    return Source(clips=_positive(clips) if colon else None, weight=weight)
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return int(text)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ product moves pixels by up to 2.7.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -63,6 +64,7 @@ def sample(image: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
     Source: paper, equations 1 to 3 (the sub-gradients of a spatial transformer).
     """
     height, width = image.shape[-2:]
+    grid = grid.nan_to_num()  # of a network that has diverged: no place in the image
     x = grid[..., 0].clamp(0, width - 1)
     y = grid[..., 1].clamp(0, height - 1)
     x0 = x.detach().floor().clamp(max=width - 2)
@@ -72,7 +74,7 @@ def sample(image: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
     flat = image.flatten(2)
 
     def corner(offset: int) -> Tensor:
-        return torch.gather(flat, 2, index + offset).reshape(*image.shape[:2], *grid.shape[1:3])
+        return torch.gather(flat[..., offset:], 2, index).reshape(*image.shape[:2], *grid.shape[1:3])
 
     top_left, top_right, bottom_left, bottom_right = corner(0), corner(1), corner(width), corner(width + 1)
     top, bottom = top_right - top_left, bottom_right - bottom_left
@@ -87,17 +89,37 @@ def sample(image: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
 class PhotometricError:
     """The error of one warp.
 
-    error (B,); jacobian (B, 2, H, W) = d e / d grid of each pixel's error e,
-    detached, zero where nothing is visible; warped (B, C, H, W), the reconstruction.
+    error (B,); warped (B, C, H, W), the reconstruction; and of what the Jacobian is made, detached:
+    residual (B, C, H, W), gradients (B, C, H, W, 2), visible (B, H, W) and the errors' n widths.
     """
 
     error: Tensor
-    jacobian: Tensor
     warped: Tensor
+    residual: Tensor
+    gradients: Tensor
+    visible: Tensor
+    widths: tuple[float, ...]
+
+    @cached_property
+    def jacobian(self) -> Tensor:
+        """Derivative d e / d grid (B, 2 n, H, W) of each pixel's error e, zero where nothing is visible.
+
+        Closed form, (d e / d r) . (d r / d grid); made when asked for, since the last level's poses need none.
+        """
+        seen = self.gradients * self.visible[:, None, ..., None]
+        slopes = [d_error_d_residual(self.residual, width) for width in self.widths]
+        return torch.cat([(slope[..., None] * seen).sum(1) for slope in slopes], dim=-1).permute(0, 3, 1, 2)
 
 
 def photometric_error(
-    sampled: Tensor, reference: Tensor, depth: Tensor, K: Tensor, pose: Tensor, charbonnier: float, lost_error: float
+    sampled: Tensor,
+    reference: Tensor,
+    depth: Tensor,
+    K: Tensor,
+    pose: Tensor,
+    charbonnier: float,
+    lost_error: float,
+    jacobian_widths: tuple[float, ...] = (),
 ) -> PhotometricError:
     """Sample one image where the other's pixels go under the pose, and compare.
 
@@ -105,22 +127,24 @@ def photometric_error(
     A pixel's error is the Charbonnier norm sqrt(|r|^2 + c^2) - c of its colour difference r or, with c = 0,
     the squared Euclidean norm |r|^2 (paper, equation 4). The pair's error is the mean over the pixels with
     depth; a pixel that leaves the image costs `lost_error`, so that looking away earns nothing.
-    The Jacobian is closed form: d e / d grid = (d e / d r) . (d r / d grid).
+    The Jacobian is that of the error itself or, if `jacobian_widths` names some, of the Charbonnier errors
+    with those c.
     """
     grid, visible = project(depth, K, pose)
     warped, gradients = sample(sampled, grid)
     residual = warped - reference
     squared = residual.square().sum(1)
-    if charbonnier > 0:
-        norm = torch.sqrt(squared + charbonnier**2)
-        pixel_error = norm - charbonnier
-        d_error_d_residual = (residual / norm[:, None]).detach()
-    else:
-        pixel_error = squared
-        d_error_d_residual = 2 * residual.detach()
-    jacobian = (d_error_d_residual[..., None] * gradients.detach()).sum(1) * visible[..., None]
+    pixel_error = torch.sqrt(squared + charbonnier**2) - charbonnier if charbonnier > 0 else squared
 
     has_depth = (depth > 0).sum((1, 2)).clamp(min=1)
     lost = has_depth - visible.sum((1, 2))
     error = ((pixel_error * visible).sum((1, 2)) + lost_error * lost) / has_depth
-    return PhotometricError(error, jacobian.permute(0, 3, 1, 2), warped)
+    widths = jacobian_widths or (charbonnier,)
+    return PhotometricError(error, warped, residual.detach(), gradients.detach(), visible, widths)
+
+
+def d_error_d_residual(residual: Tensor, charbonnier: float) -> Tensor:
+    """Derivative of a pixel's error with respect to its colour difference (B, C, H, W)."""
+    if charbonnier > 0:
+        return residual / torch.sqrt(residual.square().sum(1, keepdim=True) + charbonnier**2)
+    return 2 * residual

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
-from learned.covariance import CovarianceModel, fit, hypothesis_spread, mean_nees, pose_errors
+from learned.covariance import CovarianceModel, fit, hypothesis_spread, mean_nees, pooled, pose_errors
 
 
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(0, 1))
@@ -72,3 +72,23 @@ def test_covariance_grows_as_the_imu_window_empties() -> None:
     P = CovarianceModel(missing_imu=1.0).covariance(spread, np.array([1.0, 0.5, 0.0]))
     np.testing.assert_allclose(P[2], 4 * P[0])
     np.testing.assert_allclose(P[1], 2.25 * P[0])
+
+
+def test_pooling_keeps_the_size_of_the_spread_and_drops_its_direction() -> None:
+    A = np.random.default_rng(0).standard_normal((5, 6, 6))
+    spread = A @ A.transpose(0, 2, 1)
+    P = pooled(spread)
+    for block in (slice(0, 3), slice(3, 6)):
+        np.testing.assert_allclose(np.trace(P[:, block, block], axis1=1, axis2=2),
+                                   np.trace(spread[:, block, block], axis1=1, axis2=2))  # fmt: skip
+        np.testing.assert_allclose(P[:, block, block], P[:, block.start, block.start][:, None, None] * np.eye(3))
+
+
+def test_a_few_lost_pairs_do_not_rule_the_fit() -> None:
+    """Three of a hundred errors, a hundred times too large, change the fitted sigmas by less than a third."""
+    rng = np.random.default_rng(1)
+    errors, spread = 0.01 * rng.standard_normal((2000, 6)), np.zeros((2000, 6, 6)) + 1e-6 * np.eye(6)
+    lost = errors.copy()
+    lost[::33] *= 100
+    clean, robust = (fit(e, spread).covariance(spread[:1], np.ones(1))[0] for e in (errors, lost))
+    np.testing.assert_allclose(np.sqrt(np.diag(robust) / np.diag(clean)), 1, atol=1 / 3)

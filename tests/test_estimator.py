@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ import torch
 from fusion_io.records import CameraFrame, CameraInfo, ImuSeries, IntArray, PairEstimate
 from learned import weights
 from learned.covariance import CovarianceModel
-from learned.estimator import PAIRS_A_BATCH, estimate_pairs
+from learned.estimator import PAIRS_A_BATCH, estimate_pairs, prefetched
 from learned.violearner import NetworkConfig, VIOLearner
 
 TINY = NetworkConfig(height=32, width=64, trunk_filters=4, extra_filters=4, imu_filters=(2, 2, 4, 4, 4, 4, 4))
@@ -44,17 +45,26 @@ def frames(count: int) -> list[CameraFrame]:
     ]
 
 
+def still_frames(count: int) -> list[CameraFrame]:
+    """The same smooth picture again and again."""
+    image = cv2.GaussianBlur(frames(1)[0].image, (0, 0), 2.0)
+    image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX)
+    return [dataclasses.replace(frame, image=image) for frame in frames(count)]
+
+
 @pytest.fixture
 def weights_path(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     path = tmp_path / "tiny.pt"
-    weights.save(path, VIOLearner(TINY), CovarianceModel(), {})
+    weights.save(path, weights.Weights(VIOLearner(TINY), CovarianceModel(), CovarianceModel()), {})
     return path
 
 
-def estimate(log: Frames, path: Path, imu: ImuSeries = NO_IMU) -> tuple[list[PairEstimate], Counter[str]]:
+def estimate(
+    log: Frames, path: Path, imu: ImuSeries = NO_IMU, refined: bool = False
+) -> tuple[list[PairEstimate], Counter[str]]:
     skipped: Counter[str] = Counter()
-    return list(estimate_pairs(log, imu, path, skipped=skipped)), skipped
+    return list(estimate_pairs(log, imu, path, skipped=skipped, refined=refined)), skipped
 
 
 def test_every_consecutive_pair_is_estimated_in_order(weights_path: Path) -> None:
@@ -107,6 +117,50 @@ def test_the_same_log_gives_the_same_bits(weights_path: Path) -> None:
     for a, b in zip(estimate(log, weights_path)[0], estimate(log, weights_path)[0], strict=True):
         np.testing.assert_array_equal(a.translation, b.translation)
         np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_refinement_changes_the_pose_and_its_covariance_and_keeps_the_hypotheses(weights_path: Path) -> None:
+    log = Frames(still_frames(PAIRS_A_BATCH + 3))
+    alone, refined = estimate(log, weights_path)[0], estimate(log, weights_path, refined=True)[0]
+    for a, b in zip(alone, refined, strict=True):
+        np.testing.assert_array_equal(a.hypotheses_translation, b.hypotheses_translation)
+        assert np.linalg.norm(b.translation) < np.linalg.norm(a.translation)
+        assert np.linalg.eigvalsh(b.covariance)[0] > 0
+
+
+def test_pairs_that_refinement_cannot_improve_keep_the_networks_estimate_and_are_counted(weights_path: Path) -> None:
+    blank = [dataclasses.replace(frame, image=np.full_like(frame.image, 90)) for frame in frames(4)]
+    alone, (kept, skipped) = (
+        estimate(Frames(blank), weights_path)[0],
+        estimate(Frames(blank), weights_path, refined=True),
+    )
+    for a, b in zip(alone, kept, strict=True):
+        np.testing.assert_array_equal(a.translation, b.translation)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+    assert skipped == {"pairs_not_refined": 3}
+
+
+def test_a_change_of_image_size_within_a_log_loses_no_pair(weights_path: Path) -> None:
+    """Frames of one size are refined together; the pair across the change keeps the network's estimate."""
+    clip = frames(8)
+    small = CameraInfo(40, 20, np.array([[25.0, 0, 20], [0, 25.0, 10], [0, 0, 1]]))
+    clip[4:] = [
+        CameraFrame(f.stamp_ns, f.image[:20, :40].copy(), np.full((20, 40), 8, np.float32), small) for f in clip[4:]
+    ]
+    pairs, skipped = estimate(Frames(clip), weights_path, refined=True)
+    assert len(pairs) == 7
+    assert skipped["pairs_not_refined"] >= 1
+
+
+def test_frames_made_ahead_come_in_order_and_an_error_among_them_is_raised() -> None:
+    def items() -> Iterator[int]:
+        yield from range(20)
+        raise ValueError("broken")
+
+    ahead = prefetched(items(), 3)
+    assert [next(ahead) for _ in range(20)] == list(range(20))
+    with pytest.raises(ValueError, match="broken"):
+        next(ahead)
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -70,12 +70,23 @@ def test_depth_is_averaged_as_inverse_depth_over_valid_pixels() -> None:
     np.testing.assert_allclose(resize_depth(depth, 2, 1), [[1 / np.mean([1 / 2, 1 / 4]), 8.0]], rtol=1e-6)
 
 
-def test_depth_with_too_few_valid_pixels_is_unknown() -> None:
-    depth = np.zeros((4, 4), dtype=np.float32)
+def test_depth_with_fewer_valid_pixels_than_usual_is_unknown() -> None:
+    """A quarter of the image's own share of valid pixels is asked for; NaN and 0 are not valid."""
+    depth = np.full((4, 40), 5.0, dtype=np.float32)
+    depth[:, :4] = 0
     depth[0, :3] = 5.0
-    assert resize_depth(depth, 1, 1)[0, 0] == 0
-    depth[0, 0] = np.nan
-    assert resize_depth(depth, 1, 1)[0, 0] == 0
+    assert resize_depth(depth, 10, 1)[0, 0] == 0
+    depth[1] = 5.0
+    assert resize_depth(depth, 10, 1)[0, 0] == pytest.approx(5)
+    depth[1, :4] = np.nan
+    assert resize_depth(depth, 10, 1)[0, 0] == 0
+
+
+def test_depth_that_is_sparse_everywhere_is_kept() -> None:
+    """A scanner's points, one of thirty-six pixels, fill the small image."""
+    depth = np.zeros((48, 96), dtype=np.float32)
+    depth[3::6, 3::6] = 12.0
+    np.testing.assert_allclose(resize_depth(depth, 16, 8), 12.0, rtol=1e-6)
 
 
 @given(rate=st.floats(40, 400), source_ms=st.integers(200, 500), interval_ms=st.integers(20, 200))

@@ -1,116 +1,93 @@
-"""Laws of training: exact resume, seeded batches, and weights that come back as they were saved."""
+"""Laws of training: what a folder was begun with, mixtures, weights that come back as they were saved."""
 
 import dataclasses
-import math
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from training_samples import TINY, random_pairs
 
-from fusion_io.errors import LogError
-from learned import train, weights
-from learned.covariance import CovarianceModel
-from learned.dataset import Pairs
-from learned.train import RECIPES, Recipe, draw_batch, learning_rate_factor, optimise
-from learned.violearner import NetworkConfig, VIOLearner
+from fusion_io.errors import EXIT_USAGE, LogError, UsageError
+from learned import train
+from learned.dataset import PairSet
+from learned.train import RECIPES, Source
+from learned.violearner import PRESETS, VIOLearner
 
-TINY = NetworkConfig(height=32, width=64, trunk_filters=4, extra_filters=4, imu_filters=(2, 2, 4, 4, 4, 4, 4))
-RECIPE = Recipe(steps=6, batch=2, validate_every=2)
-
-
-def random_pairs(count: int = 8) -> Pairs:
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 255, (2, count, 1, TINY.height, TINY.width), dtype=np.uint8)
-    K = np.array([[40, 0, 31.5], [0, 40, 15.5], [0, 0, 1]], dtype=np.float32)
-    return Pairs(
-        source=images[0],
-        target=images[1],
-        source_depth=rng.uniform(4, 20, (count, TINY.height, TINY.width)).astype(np.float16),
-        K=np.tile(K, (count, 1, 1)),
-        imu=rng.normal(size=(count, 20, 6)).astype(np.float32),
-        interval_s=np.full(count, 0.1, np.float32),
-        T_source_target=np.tile(np.eye(4), (count, 1, 1)),
-    )
-
-
-def new_model() -> VIOLearner:
-    torch.manual_seed(0)
-    return VIOLearner(TINY)
-
-
-def test_an_interrupted_training_resumes_to_the_same_curve_and_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pairs = random_pairs()
-    through = new_model()
-    optimise(through, RECIPE, pairs, pairs, tmp_path / "a", 0, "cpu")
-
-    def interrupted(*arguments: object) -> object:
-        if arguments[3] == 5:
-            raise KeyboardInterrupt
-        return draw_batch(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(train, "draw_batch", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        optimise(new_model(), RECIPE, pairs, pairs, tmp_path / "b", 0, "cpu")
-    monkeypatch.undo()
-    resumed = new_model()
-    optimise(resumed, RECIPE, pairs, pairs, tmp_path / "b", 0, "cpu")
-    assert (tmp_path / "b" / "curve.csv").read_text() == (tmp_path / "a" / "curve.csv").read_text()
-    for name, value in through.state_dict().items():
-        assert torch.equal(resumed.state_dict()[name], value), name
-
-
-def test_the_batch_of_a_step_is_a_function_of_seed_and_step() -> None:
-    pairs = random_pairs()
-    first, again = (draw_batch(pairs, RECIPE, 0, 3, "cpu") for _ in range(2))
-    other = draw_batch(pairs, RECIPE, 0, 4, "cpu")
-    assert torch.equal(first.source, again.source)
-    assert not torch.equal(first.source, other.source)
+NETWORK = dataclasses.asdict(PRESETS["fast"])
 
 
 def test_paper_recipe_is_the_papers() -> None:
     recipe = RECIPES["paper"]
     assert (recipe.batch, recipe.learning_rate, recipe.steps, recipe.validate_every) == (32, 2e-4, 100_000, 500)
-    assert train.MOMENTA == (0.9, 0.99)
-    assert learning_rate_factor(recipe, 20_000) == 0.5
+    assert recipe.validation_share == 0.05
+    assert recipe.bias_penalty > 0
+    assert recipe.descent().learning_rate_at(20_000) == pytest.approx(1e-4)
 
 
-def test_cosine_decay_ends_low_and_starts_warm() -> None:
-    recipe = RECIPES["fast"]
-    factors = [learning_rate_factor(recipe, step) for step in range(recipe.steps)]
-    assert factors[0] < 0.02
-    assert max(factors) <= 1
-    assert factors[-1] == pytest.approx(0.01, abs=1e-3)
-    assert math.isclose(max(factors), factors[train.WARM_UP_STEPS], rel_tol=0.01)
+@pytest.mark.parametrize(
+    ("text", "source"),
+    [
+        ("sim", Source()),
+        ("sim:40", Source(clips=40)),
+        ("sim:40@0.5", Source(clips=40, weight=0.5)),
+        ("a/seq09.mcap", Source(Path("a/seq09.mcap"))),
+        ("a/seq09.mcap@2", Source(Path("a/seq09.mcap"), weight=2.0)),
+        ("me@home/seq09.mcap", Source(Path("me@home/seq09.mcap"))),
+    ],
+)
+def test_a_source_is_the_simulator_or_a_log_with_a_weight(text: str, source: Source) -> None:
+    assert train._source(text) == source
 
 
-def test_weights_come_back_as_they_were_saved(tmp_path: Path) -> None:
-    model = new_model()
-    covariance = CovarianceModel(gain=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), missing_imu=0.7)
-    weights.save(tmp_path / "w.pt", model, covariance, {"seed": 0, "recipe": dataclasses.asdict(RECIPE)})
-    loaded, loaded_covariance = weights.load(tmp_path / "w.pt")
-    assert loaded.config == TINY
-    assert loaded_covariance == covariance
-    assert not loaded.training
-    for name, value in model.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value)
+@pytest.mark.parametrize("text", ["sim:0", "sim:x", "sim@0", "sim@-1", "sim@nan", "a.mcap@inf"])
+def test_a_source_that_makes_no_sense_is_a_usage_error(text: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as error:
+        train.main(["--out", str(tmp_path), "--data", text])
+    assert error.value.code == EXIT_USAGE
 
 
-@pytest.mark.parametrize("content", [None, b"", b"hello", b"PK\x03\x04 broken"])
-def test_what_is_not_a_weights_file_is_refused_in_a_line(tmp_path: Path, content: bytes | None) -> None:
-    path = tmp_path / "w.pt"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(LogError, match=r"w\.pt") as error:
-        weights.load(path)
+def test_the_same_command_may_go_on(tmp_path: Path) -> None:
+    for _ in range(2):
+        train.begin(tmp_path / "out", "paper", RECIPES["paper"], 0, [Source(clips=4)], "float32", NETWORK)
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["preset"] == "paper"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"preset": "paper"}, 'preset "fast", not "paper"'),
+        ({"recipe": dataclasses.replace(RECIPES["fast"], steps=9)}, "recipe.steps 4000, not 9"),
+        ({"seed": 1}, "seed 0, not 1"),
+        ({"data": [Source(clips=4)]}, r"data .*not .*4"),
+        ({"precision": "bf16"}, "precision"),
+        ({"network": NETWORK | {"trunk_filters": 8}}, "network.trunk_filters 32, not 8"),
+    ],
+)
+def test_other_settings_than_the_folder_was_begun_with_are_refused(
+    tmp_path: Path, change: dict[str, object], words: str
+) -> None:
+    begun = {"preset": "fast", "recipe": RECIPES["fast"], "seed": 0, "data": [Source()], "precision": "float32"}
+    begun["network"] = NETWORK
+    train.begin(tmp_path, **begun)
+    with pytest.raises(UsageError, match=words) as error:
+        train.begin(tmp_path, **(begun | change))
     assert "\n" not in str(error.value)
 
 
-def test_pairs_survive_a_round_trip_through_a_file(tmp_path: Path) -> None:
+def test_a_log_that_is_not_there_is_refused_before_anything_is_rendered(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"absent\.mcap"):
+        train.train("fast", RECIPES["fast"], tmp_path / "out", data=[Source(tmp_path / "absent.mcap")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_imu_is_standardised_by_what_was_measured_and_left_alone_where_nothing_was() -> None:
+    model = VIOLearner(TINY)
+    before = model.imu_mean.clone()
     pairs = random_pairs()
-    pairs.save(tmp_path / "pairs.npz")
-    loaded = Pairs.load(tmp_path / "pairs.npz")
-    for field in dataclasses.fields(Pairs):
-        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(pairs, field.name))
+    silent = dataclasses.replace(pairs, imu=np.full_like(pairs.imu, np.nan))
+    train.standardise_imu(model, PairSet.of([silent]))
+    assert torch.equal(model.imu_mean, before)
+    train.standardise_imu(model, PairSet.of([silent, pairs]))
+    np.testing.assert_allclose(model.imu_mean.numpy(), pairs.imu.reshape(-1, 6).mean(0), atol=1e-5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +13,39 @@ from learned.covariance import CovarianceModel
 from learned.violearner import NetworkConfig, VIOLearner
 
 DEFAULT = Path(__file__).with_name("fast.pt")
-FORMAT = 1
+FORMAT = 2
 
 
-def save(path: Path, model: VIOLearner, covariance: CovarianceModel, training: dict[str, Any]) -> None:
-    """Write the network, its configuration, its covariance model and how it was trained as one file."""
+@dataclass(frozen=True)
+class Weights:
+    """A trained network, and the covariances fitted for its winner and for the pose refined from it."""
+
+    model: VIOLearner
+    covariance: CovarianceModel
+    refined_covariance: CovarianceModel
+
+
+def save(path: Path, weights: Weights, training: dict[str, Any]) -> None:
+    """Write the network, its configuration, its covariance models and how it was trained as one file."""
     content = {
         "format": FORMAT,
-        "config": asdict(model.config),
-        "state": {name: value.detach().cpu().clone() for name, value in model.state_dict().items()},
-        "covariance": covariance.to_dict(),
+        "config": asdict(weights.model.config),
+        "state": {name: value.detach().cpu().clone() for name, value in weights.model.state_dict().items()},
+        "covariance": weights.covariance.to_dict(),
+        "refined_covariance": weights.refined_covariance.to_dict(),
         "training": training,
     }
     partial = path.with_suffix(".partial")
-    torch.save(content, partial)
+    with partial.open("wb") as file:  # given a path, torch writes its name into the file
+        torch.save(content, file)
     partial.replace(path)
 
 
-def load(path: Path | None = None) -> tuple[VIOLearner, CovarianceModel]:
-    """The network, ready for inference, and its covariance model. Raises LogError for a file that is not weights."""
+def load(path: Path | None = None) -> Weights:
+    """The network, ready for inference, and its covariance models.
+
+    Raises LogError for a file that is not weights.
+    """
     path = DEFAULT if path is None else path
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -43,4 +57,6 @@ def load(path: Path | None = None) -> tuple[VIOLearner, CovarianceModel]:
         raise LogError(f"{path}: not a weights file of format {FORMAT}")
     model = VIOLearner(NetworkConfig(**content["config"]))
     model.load_state_dict(content["state"])
-    return model.eval(), CovarianceModel(**content["covariance"])
+    return Weights(
+        model.eval(), CovarianceModel(**content["covariance"]), CovarianceModel(**content["refined_covariance"])
+    )
