@@ -211,7 +211,7 @@ def stages(log: Log, imu: ImuSeries, weights: Weights, pairs: int) -> dict[str, 
         before = batch[-1]
         couples = list(pairwise(batch))
         with lapped(weights.model, laps):
-            inferences = infer_batch(weights, [(source.network, target.network) for source, target in couples], imu)
+            inferences = infer_batch(weights, couples, imu)
         laps("covariance")
         refine_batch(weights, couples, inferences, np.stack([np.eye(4)] * len(couples)))
         laps("refinement: steps")
@@ -237,6 +237,11 @@ def write_log(path: Path, frames: int) -> None:
             log.frame(CameraFrame(frame.stamp_ns, image, depth, camera))
 
 
+def bare(couples: list[NetworkPair]) -> list[tuple[ReadyFrame, ReadyFrame]]:
+    """Pairs of the network's frames as the estimator takes them where nothing is to be refined."""
+    return [(ReadyFrame(source, None), ReadyFrame(target, None)) for source, target in couples]
+
+
 def measure(log: Log, name: str, pairs: int, rounds: int, console: Console) -> None:
     """Both tables of a preset."""
     config, imu = PRESETS[name], log.imu()
@@ -254,12 +259,12 @@ def measure(log: Log, name: str, pairs: int, rounds: int, console: Console) -> N
     single = min(ONE_BY_ONE, pairs)
     ways: dict[str, Callable[[], float]] = {
         "plain, one pair at a time": lambda: one_by_one(log, config, single, plain_network),
-        "one pair at a time": lambda: one_by_one(log, config, single, lambda c: infer_batch(fast, c, imu)),
+        "one pair at a time": lambda: one_by_one(log, config, single, lambda c: infer_batch(fast, bare(c), imu)),
         "streaming": lambda: streaming(log, imu, shipped, pairs, refined=False),
         "streaming, refined": lambda: streaming(log, imu, shipped, pairs, refined=True),
     }
     plain_network([(first, second)])  # the first call of a kernel compiles it
-    infer_batch(fast, [(first, second)], imu)
+    infer_batch(fast, bare([(first, second)]), imu)
     split, seconds = defaultdict(list), defaultdict(list)
     for _ in range(rounds):
         for stage, value in stages(log, imu, shipped, pairs).items():

@@ -17,7 +17,7 @@ the lowest error goes on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -144,14 +144,10 @@ def refine(
     starts (B, 4, 4): T_source_target of the network; prior (B, 6, 6): its covariance; others (M, B, 4, 4): further
     starts, tried at the coarsest scale.
     """
-    problem = Problem(pairs, starts, prior)
     coarsest = len(pairs[0][0].images) - 1
-    start = problem.state(inverse(starts))
-    begins = [start, *(problem.state(inverse(other)) for other in others)]
-    found = [problem.descend(coarsest, begin, COARSE_STEPS, COARSE_SHARE) for begin in begins]
-    best = torch.stack([problem.cost(coarsest, state, COARSE_SHARE) for state in found]).argmin(0)
-    rows = torch.arange(len(pairs))
-    state = State(*(torch.stack(values)[best, rows] for values in zip(*found, strict=True)))
+    problem = Problem(pairs, starts, prior, range(coarsest + 1))
+    start = problem.state(coarsest, inverse(starts))
+    state = search([*pairs], starts, prior, np.concatenate([starts[None], others]), coarsest)
     for level in range(coarsest, -1, -1):
         state = problem.descend(level, state, FINE_STEPS)
     improved = problem.cost(0, state) < problem.cost(0, start)
@@ -159,6 +155,18 @@ def refine(
     information, _ = problem.linearise(0, State(T_target_source, state.light))
     covariance = torch.linalg.inv(information)[:, :6, :6]
     return Refined(inverse(T_target_source.numpy()), covariance.numpy(), improved.numpy())
+
+
+def search(
+    pairs: list[tuple[FullFrame, FullFrame]], starts: FloatArray, prior: FloatArray, begins: FloatArray, level: int
+) -> State:
+    """The best state at the coarsest scale from several begins (M, B, 4, 4), all of them descended at once."""
+    count, size = len(begins), len(pairs)
+    repeated = np.tile(starts, (count, 1, 1)), np.tile(prior, (count, 1, 1))
+    problem = Problem(pairs * count, *repeated, [level], COARSE_SHARE)
+    found = problem.descend(level, problem.state(level, inverse(begins.reshape(-1, 4, 4))), COARSE_STEPS)
+    best = problem.cost(level, found).reshape(count, size).argmin(0) * size + torch.arange(size)
+    return State(found.T_target_source[best], found.light[best])
 
 
 class State(NamedTuple):
@@ -178,23 +186,34 @@ class Level(NamedTuple):
 class Problem:
     """B pairs as least squares over theta = T_target_source, perturbed on the left, and the light."""
 
-    def __init__(self, pairs: Sequence[tuple[FullFrame, FullFrame]], starts: FloatArray, prior: FloatArray) -> None:
+    def __init__(
+        self,
+        pairs: Sequence[tuple[FullFrame, FullFrame]],
+        starts: FloatArray,
+        prior: FloatArray,
+        levels: Iterable[int],
+        share: int = 1,
+    ) -> None:
+        """For the given scales, with every `share`-th point; starts and prior as in `refine`."""
         points = [source.points for source, _ in pairs if source.points is not None]
-        pixel, self.point, self.used = (torch.stack(values) for values in zip(*points, strict=True))
+        pixel, self.point, self.used = (torch.stack(v)[:, ::share] for v in zip(*points, strict=True))
         self.K = torch.stack([source.K for source, _ in pairs])
         self.starts = RigidTransform.from_matrix(starts)
         self.prior_information = torch.linalg.inv(torch.from_numpy(prior))
-        self.levels = []
-        for level in range(len(pairs[0][0].images)):
-            own = interpolate([source.images[level] for source, _ in pairs], at_level(pixel, level))
-            self.levels.append(Level([target.images[level] for _, target in pairs], own))
+        self.levels = {
+            level: Level(
+                [target.images[level] for _, target in pairs],
+                interpolate([source.images[level] for source, _ in pairs], at_level(pixel, level)),
+            )
+            for level in levels
+        }
 
-    def state(self, T_target_source: FloatArray) -> State:
-        """The state at a pose, with the light that fits best there."""
+    def state(self, level: int, T_target_source: FloatArray) -> State:
+        """The state at a pose, with the light that fits best there at a scale."""
         T = torch.from_numpy(T_target_source)
-        view = self.look(len(self.levels) - 1, T)
+        view = self.look(level, T)
         weight = view.visible.double()
-        x, y = self.levels[-1].own[..., 0].double(), view.values.double()
+        x, y = self.levels[level].own[..., 0].double(), view.values.double()
         count = weight.sum(1).clamp(min=1)
         mean_x, mean_y = (weight * x).sum(1) / count, (weight * y).sum(1) / count
         dx, dy = x - mean_x[:, None], y - mean_y[:, None]
@@ -202,10 +221,10 @@ class Problem:
         gain = gain.clamp(0.5, 2.0)
         return State(T, torch.stack([gain, mean_y - gain * mean_x], dim=1))
 
-    def descend(self, level: int, state: State, steps: int, share: int = 1) -> State:
-        """Gauss-Newton steps at a scale with every `share`-th point."""
+    def descend(self, level: int, state: State, steps: int) -> State:
+        """Gauss-Newton steps at a scale."""
         for _ in range(steps):
-            information, gradient = self.linearise(level, state, share)
+            information, gradient = self.linearise(level, state)
             step = -torch.linalg.solve(information, gradient)
             turn = torch.from_numpy(RigidTransform.from_exp_coords(step[:, :6].numpy()).as_matrix())
             state = State(turn @ state.T_target_source, state.light + step[:, 6:])
@@ -213,10 +232,10 @@ class Problem:
                 break
         return state
 
-    def linearise(self, level: int, state: State, share: int = 1) -> tuple[Tensor, Tensor]:
+    def linearise(self, level: int, state: State) -> tuple[Tensor, Tensor]:
         """Information (B, 8, 8) and gradient (B, 8) of the objective at a state: rotation, translation, light."""
-        view = self.look(level, state.T_target_source, share)
-        values, own = self.levels[level].own[:, ::share, 0], self.levels[level].own[:, ::share, 1:]
+        view = self.look(level, state.T_target_source)
+        values, own = self.levels[level].own[..., 0], self.levels[level].own[..., 1:]
         gain, offset = state.light[:, :1].float(), state.light[:, 1:].float()
         residual = view.values - gain * values - offset
         sigma = scale(residual, view.visible)
@@ -254,24 +273,24 @@ class Problem:
         translation = [gx * inverse_z, gy * inverse_z, gz * inverse_z]
         return torch.stack([*rotation, *translation, -values, torch.full_like(values, -1.0)], dim=2)
 
-    def cost(self, level: int, state: State, share: int = 1) -> Tensor:
+    def cost(self, level: int, state: State) -> Tensor:
         """A robust mean (B,) of the residuals in pixels of displacement; points out of view cost a pixel.
 
         Comparable between the states of a pair, unlike the objective, whose scale is estimated anew at each.
         """
-        view = self.look(level, state.T_target_source, share)
-        used = self.used[:, ::share]
-        values, own = self.levels[level].own[:, ::share, 0], self.levels[level].own[:, ::share, 1:]
+        view = self.look(level, state.T_target_source)
+        used = self.used
+        values, own = self.levels[level].own[..., 0], self.levels[level].own[..., 1:]
         residual = view.values - state.light[:, :1].float() * values - state.light[:, 1:].float()
         count = used.sum(1).clamp(min=1)
         unit = ((own.abs().sum(2) * used).sum(1) / count).clamp(min=LEAST_GRADIENT)
         pixels = torch.where(view.visible, residual / unit[:, None], torch.ones_like(residual))
         return (torch.log1p(pixels.square()) * used).sum(1) / count
 
-    def look(self, level: int, T_target_source: Tensor, share: int = 1) -> View:
+    def look(self, level: int, T_target_source: Tensor) -> View:
         """Where the points land in the target, and what is seen there."""
         T, images = T_target_source.float(), self.levels[level].targets
-        point = self.point[:, ::share] @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]
+        point = self.point @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]
         inverse_z = 1 / point[..., 2].clamp(min=NEAREST_DEPTH_M)
         x, y = point[..., 0] * inverse_z, point[..., 1] * inverse_z
         K = self.K.float()
@@ -280,7 +299,7 @@ class Problem:
         height, width = images[0].shape[-2:]
         inside = (grid >= -0.5).all(2) & (grid[..., 0] <= width - 0.5) & (grid[..., 1] <= height - 0.5)
         seen = interpolate(images, grid)
-        visible = inside & self.used[:, ::share] & (point[..., 2] > NEAREST_DEPTH_M)
+        visible = inside & self.used & (point[..., 2] > NEAREST_DEPTH_M)
         return View(seen[..., 0], seen[..., 1:], visible, x, y, inverse_z)
 
 

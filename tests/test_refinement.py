@@ -52,8 +52,8 @@ def smooth_frame(phase: float) -> FullFrame:
 def test_the_jacobian_is_the_derivative_of_the_residual(axis: int) -> None:
     """Against differences over about a pixel, as the image's gradients are; the median over the points is judged."""
     start = perturbed(np.eye(4), 1)
-    problem = Problem([(smooth_frame(0.0), smooth_frame(0.3))], start[None], PRIOR[None])
-    state = problem.state(np.linalg.inv(start)[None])
+    problem = Problem([(smooth_frame(0.0), smooth_frame(0.3))], start[None], PRIOR[None], [0])
+    state = problem.state(0, np.linalg.inv(start)[None])
     values = problem.levels[0].own[..., 0]
 
     def residual(step: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -176,5 +176,5 @@ def test_the_same_pair_gives_the_same_bits() -> None:
 def test_a_state_has_the_light_that_fits_best() -> None:
     first, second = smooth_frame(0.0), smooth_frame(0.0)
     second.images[0] = with_gradients(0.9 * first.images[0][0].numpy() + 7)
-    problem = Problem([(first, second)], np.eye(4)[None], PRIOR[None])
-    np.testing.assert_allclose(problem.state(np.eye(4)[None]).light[0], [0.9, 7.0], atol=0.02)
+    problem = Problem([(first, second)], np.eye(4)[None], PRIOR[None], [0])
+    np.testing.assert_allclose(problem.state(0, np.eye(4)[None]).light[0], [0.9, 7.0], atol=0.02)
