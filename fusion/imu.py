@@ -14,7 +14,7 @@ squares): that makes the estimates efficient and their standard deviations hones
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -48,8 +48,14 @@ MAX_TIME_OFFSET_STD_S = 0.02
 GRAVITY_RANGE = (8.8, 10.8)  # m/s^2, for the median magnitude that the accelerometer shows
 MAX_FAULTY_SHARE = 0.2
 
-# Where gyro and pairs disagree for long, the gyro is at fault: front ends fail for single pairs, but an IMU that
-# stalled, saturated, or was filled in by interpolation did so for a while.
+# A gyro that runs in exactly equal steps on all axes for so many samples was not measured: it hung, or somebody filled
+# a gap by interpolation, as KITTI's odometry files are in places for 1.5 s. So few samples may kink in between.
+FILLED_SAMPLES = 20
+FILLED_KINK = 3
+EQUAL_STEPS = 1e-9  # rad/s
+
+# Where gyro and pairs disagree for long, the gyro is at fault too: front ends fail for single pairs, but an IMU that
+# saturates or loses its clock does so for a while.
 CONTRADICTION = 8.0  # standard deviations
 CONTRADICTION_PAIRS = 6  # at least so many in a row
 CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
@@ -86,7 +92,7 @@ class ImuCalibration:
     gyro_bias (3,) rad/s in IMU axes, zero for a gyro that seems to have been corrected already. used, reason: the
     verdict and what led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad
     (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2):
-    intervals on the IMU's clock in which the gyro contradicts the pairs for long.
+    intervals on the IMU's clock in which the gyro was not measured, or contradicts the pairs for long.
     """
 
     rotation_imu_camera: Rotation | None
@@ -114,6 +120,10 @@ def calibrate(
     problem = _sensor_problem(imu)
     if problem:
         return left_out(problem)
+    filled_ns = _filled_in(imu)
+    imu = _outside(imu, filled_ns)
+    if len(imu) < MIN_PAIRS:
+        return left_out("its gyro hangs")
     gyro, turns = _Gyro(imu), _turns(pairs, int(imu.stamps_ns[0]))
     offset_s, correlation = _correlate(gyro, turns) if time_offset_s is None else (time_offset_s, 1.0)
     covered = gyro.measured(turns.source_s + offset_s, turns.target_s + offset_s)
@@ -133,16 +143,17 @@ def calibrate(
     if learned:  # a few percent of a lasting turn look like a bias
         rate = np.mean(fit.turns.turned, axis=0) / np.mean(fit.turns.target_s - fit.turns.source_s)
         gyro_bias_std = float(np.hypot(gyro_bias_std, MAX_SCALE_ERROR_LEARNED * np.linalg.norm(rate)))
+    faulty_ns = np.concatenate([filled_ns, fit.faulty_intervals() + imu.stamps_ns[0]])
     return ImuCalibration(
         fit.rotation_imu_camera,
         fit.time_offset_s,
         gyro_bias,
         used=problem is None,
-        reason=problem or _summary(fit),
+        reason=problem or _summary(fit, len(faulty_ns)),
         rotation_std_rad=fit.std[ROTATION],
         time_offset_std_s=float(fit.std[OFFSET][0]),
         gyro_bias_std=gyro_bias_std,
-        faulty_ns=fit.faulty_intervals() + imu.stamps_ns[0],
+        faulty_ns=faulty_ns,
     )
 
 
@@ -153,16 +164,26 @@ def in_camera_axes(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
     """
     if calibration.rotation_imu_camera is None:
         raise ValueError("the mounting of the IMU is unknown")
-    good = np.ones(len(imu), dtype=bool)
-    for start_ns, end_ns in calibration.faulty_ns:
-        good &= (imu.stamps_ns < start_ns) | (imu.stamps_ns > end_ns)
     to_camera = calibration.rotation_imu_camera.inv()
-    return ImuSeries(
-        imu.stamps_ns[good] - round(calibration.time_offset_s * NANOSECONDS),
-        to_camera.apply(imu.angular_velocity[good] - calibration.gyro_bias),
-        to_camera.apply(imu.linear_acceleration[good]),
-        imu.angular_velocity_std,
-        imu.linear_acceleration_std,
+    good = _outside(imu, calibration.faulty_ns)
+    return replace(
+        good,
+        stamps_ns=good.stamps_ns - round(calibration.time_offset_s * NANOSECONDS),
+        angular_velocity=to_camera.apply(good.angular_velocity - calibration.gyro_bias),
+        linear_acceleration=to_camera.apply(good.linear_acceleration),
+    )
+
+
+def _outside(imu: ImuSeries, intervals_ns: IntArray) -> ImuSeries:
+    """The samples outside of all intervals (M, 2), ends included."""
+    good = np.ones(len(imu), dtype=bool)
+    for start_ns, end_ns in intervals_ns:
+        good &= (imu.stamps_ns < start_ns) | (imu.stamps_ns > end_ns)
+    return replace(
+        imu,
+        stamps_ns=imu.stamps_ns[good],
+        angular_velocity=imu.angular_velocity[good],
+        linear_acceleration=imu.linear_acceleration[good],
     )
 
 
@@ -236,6 +257,17 @@ def _sensor_problem(imu: ImuSeries) -> str | None:
     if not GRAVITY_RANGE[0] <= shown <= GRAVITY_RANGE[1]:
         return f"its accelerometer does not show gravity, but {shown:.3g} m/s^2 (median magnitude)"
     return None
+
+
+def _filled_in(imu: ImuSeries) -> IntArray:
+    """The intervals (M, 2) in nanoseconds in which the gyro was not measured."""
+    if len(imu) < FILLED_SAMPLES:
+        return np.zeros((0, 2), dtype=np.int64)
+    equal = np.max(np.abs(np.diff(imu.angular_velocity, 2, axis=0)), axis=1) <= EQUAL_STEPS
+    lasting = binary_opening(binary_closing(equal, np.ones(FILLED_KINK + 1)), np.ones(FILLED_SAMPLES))
+    inner = np.pad(lasting, 1)  # a sample has a step on either side
+    runs = [run[0] for run in find_objects(label(inner)[0])]
+    return np.array([(imu.stamps_ns[run][0], imu.stamps_ns[run][-1]) for run in runs], dtype=np.int64).reshape(-1, 2)
 
 
 # ------------------------------------------------------------------------------------------------------ estimation
@@ -436,12 +468,12 @@ def _fit_problem(fit: _Fit, max_scale_error: float) -> str | None:
     return None
 
 
-def _summary(fit: _Fit) -> str:
-    """One line on what was estimated, and how well."""
+def _summary(fit: _Fit, stretches: int) -> str:
+    """One line on what was estimated, how well, and how many stretches of the IMU are faulty."""
     rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
     mounting = f"estimated to +-{np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
     deviation = f"+-{1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
     offset = f"{1e3 * fit.time_offset_s:.1f} ms ({deviation})"
-    faulty = f"; left out in {len(fit.faulty_intervals())} faulty stretches" if fit.faulty.any() else ""
+    faulty = f"; left out in {stretches} faulty stretches" if stretches else ""
     explained = f"its gyro explains {fit.explained[-1]:.1%} of the turning of {len(fit.predicted)} pairs"
     return f"{explained}; mounting {mounting}, time offset {offset}{faulty}"

@@ -213,12 +213,20 @@ def test_without_turning_about_two_axes_a_mounting_is_not_claimed(style: DriveSt
     assert given_all.used, given_all.reason
 
 
-def test_a_stretch_in_which_the_gyro_stalls_is_left_out_of_it() -> None:
-    """Five seconds of one value, while the camera turns on: those samples go, and hardly any others."""
+STRETCHES = {
+    "hangs": lambda rates, t: np.broadcast_to(rates[0], rates.shape),
+    "was filled in by interpolation": lambda rates, t: rates[0] + (rates[-1] - rates[0]) * t[:, None] / t[-1],
+    "shows what is not there": lambda rates, t: rates + 0.5 * np.sin(t)[:, None],
+}
+
+
+@pytest.mark.parametrize("fault", STRETCHES)
+def test_a_stretch_in_which_the_gyro_is_wrong_is_left_out(fault: str) -> None:
+    """Three seconds while the camera turns on: those samples go, and hardly any others."""
     log = _hand(offset_s=0.04)
-    begin, end = (int(np.searchsorted(log.imu.stamps_ns, START_NS + at * NANOSECONDS)) for at in (20, 25))
+    begin, end = (int(np.searchsorted(log.imu.stamps_ns, START_NS + at * NANOSECONDS)) for at in (20, 23))
     rates = log.imu.angular_velocity.copy()
-    rates[begin:end] = rates[begin]
+    rates[begin:end] = STRETCHES[fault](rates[begin:end], np.arange(end - begin) / IMU_HZ)
     calibration = calibrate(log.pairs, replace(log.imu, angular_velocity=rates), None, None)
     assert calibration.used, calibration.reason
     assert "faulty" in calibration.reason
@@ -227,6 +235,15 @@ def test_a_stretch_in_which_the_gyro_stalls_is_left_out_of_it() -> None:
     assert np.mean(lost[begin + 20 : end - 20]) > 0.9
     assert np.sum(lost) < 1.2 * (end - begin)
     assert _angle(calibration.rotation_imu_camera, MOUNTING) < np.deg2rad(0.2)
+
+
+def test_a_gyro_that_hangs_all_along_is_left_out() -> None:
+    """Equal steps from end to end: it is not stuck on one value, but nothing was measured."""
+    log = _hand()
+    ramp = np.outer(np.arange(len(log.imu)), [1e-5, 2e-5, -1e-5])
+    calibration = calibrate(log.pairs, replace(log.imu, angular_velocity=ramp), None, None)
+    assert not calibration.used
+    assert "hangs" in calibration.reason
 
 
 def test_in_camera_axes_the_gyro_turns_as_the_camera_does() -> None:
