@@ -21,13 +21,13 @@ def run(module: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]
 
 
 def test_kitti_in_three_commands_of_which_the_second_is_interrupted(tmp_path: Path, shared_data: Path) -> None:
-    """Convert, train, evaluate, as docs/training.md has it, with a few frames and steps."""
+    """Convert, train, evaluate, as docs/training.md has it, with a few frames; enough steps to be interrupted in."""
     root, log, out = shared_data / "kitti" / "odometry", tmp_path / "06.mcap", tmp_path / "out"
     done = run("fusion_io.convert", "kitti-odometry", "--root", root, "--sequence", "06", "--frames", "0:10",
                "--imu", root / "imu" / "06.mat", "--out", log)  # fmt: skip
     assert done.returncode == 0, done.stderr
 
-    arguments = ["--data", log, "--steps", "3", *SMALL, "--out", out]
+    arguments = ["--data", log, "--steps", "30", *SMALL, "--out", out]
     command = [sys.executable, "-m", "learned.train", *map(str, arguments)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     while not (out / "curve.csv").exists():  # the steps begin
