@@ -15,17 +15,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
+from fusion_io.records import FloatArray, IntArray, Trajectory
 
 # Of the KITTI odometry devkit (cpp/evaluate_odometry.cpp).
 KITTI_SEGMENT_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_START_EVERY_FRAMES = 10
-
-# A hole in the ground truth longer than this is not bridged by interpolation: the frames inside it are not compared.
-MAX_GROUND_TRUTH_GAP_S = 1.0
 
 # A standard deviation below a micrometre or a microradian claims nothing: it marks the pose that defines the world.
 MIN_VARIANCE = 1e-12
@@ -109,26 +105,13 @@ def common(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajectory, 
     The covariances are kept: where the ground truth begins after the estimate's first pose, they still speak of the
     error since then.
     """
-    spanned = covers(ground_truth, estimate.stamps_ns)
+    spanned = ground_truth.covers(estimate.stamps_ns)
     stamps = estimate.stamps_ns[spanned]
     covariances = None if estimate.covariances is None else estimate.covariances[spanned]
     compared = Trajectory(stamps, estimate.poses[spanned], covariances)
     if not len(stamps):
         return compared, Trajectory(stamps, compared.poses)
     return compared.relative_to_first(), Trajectory(stamps, ground_truth.at(stamps)).relative_to_first()
-
-
-def covers(trajectory: Trajectory, stamps_ns: IntArray) -> NDArray[np.bool_]:
-    """Which stamps (N,) lie between two poses of a trajectory that are close enough in time to interpolate."""
-    known = trajectory.stamps_ns
-    if len(known) < 2:
-        return np.zeros(len(stamps_ns), dtype=np.bool_)
-    after = np.clip(np.searchsorted(known, stamps_ns), 1, len(known) - 1)
-    inside = (stamps_ns >= known[0]) & (stamps_ns <= known[-1])
-    exact = (stamps_ns == known[after]) | (stamps_ns == known[after - 1])
-    near = known[after] - known[after - 1] <= MAX_GROUND_TRUTH_GAP_S * NANOSECONDS
-    covered: NDArray[np.bool_] = inside & (exact | near)
-    return covered
 
 
 def kitti_errors(

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fusion.evaluation import common, covers, errors_over_time
+from fusion.evaluation import common, errors_over_time
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 
 # Colours that the colour-blind can tell apart (Okabe and Ito 2008), and different dashes for print in grey.
@@ -78,7 +78,7 @@ def _draw_path(axes: Axes, trajectory: Trajectory, style: dict[str, Any]) -> Non
 
 def _laid_on(estimate: Trajectory, ground_truth: Trajectory) -> Trajectory | None:
     """The ground truth in the world of the estimate, equal to it at the first frame that both know."""
-    spanned = covers(ground_truth, estimate.stamps_ns)
+    spanned = ground_truth.covers(estimate.stamps_ns)
     if not spanned.any():
         return None
     _, truth = common(estimate, ground_truth)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, FusionError, LogError
+from learned.train import positive_integer
 
 if TYPE_CHECKING:
     from fusion_io.reader import Log
@@ -79,8 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--log", type=Path, required=True, help="MCAP log with images and depth")
     parser.add_argument("--weights", type=Path, help="weights to begin with (default: those that ship)")
     parser.add_argument("--out", type=Path, required=True, help="the weights file to write")
-    parser.add_argument("--steps", type=_steps, default=Adaptation.steps, help="at most (default %(default)s)")
-    parser.add_argument("--threads", type=_steps, help="threads (default: torch's)")
+    parser.add_argument(
+        "--steps", type=positive_integer, default=Adaptation.steps, help="at most (default %(default)s)"
+    )
+    parser.add_argument("--threads", type=positive_integer, help="threads (default: torch's)")
     options = parser.parse_args(arguments)
 
     from fusion_io.reader import open_log
@@ -174,12 +177,6 @@ def photometric_error(model: VIOLearner, pairs: PairSet) -> float:
     from learned.optimisation import run
 
     return float(run(model, pairs, "cpu")["error"].mean())
-
-
-def _steps(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return int(text)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom, chi2, spearmanr
 
 from fusion_io.records import FloatArray
+from learned.covariance import nees
 
 AXES = ("rotation_x", "rotation_y", "rotation_z", "translation_x", "translation_y", "translation_z")
 
@@ -47,12 +48,6 @@ def consistency(errors: FloatArray, covariances: FloatArray) -> dict[str, Any]:
         "rank_correlation": rank_correlation(errors, covariances),
         "by_axis": by_axis(errors, covariances),
     }
-
-
-def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Normalised estimation error squared (N,), e' P^-1 e."""
-    weighted = np.linalg.solve(covariances, errors[..., None])[..., 0]
-    return np.asarray(np.sum(errors * weighted, axis=1))
 
 
 def negative_log_likelihood(errors: FloatArray, covariances: FloatArray) -> FloatArray:

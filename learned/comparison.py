@@ -10,17 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_io.errors import LogError
-from fusion_io.records import NANOSECONDS, FloatArray, IntArray, PairEstimate, Trajectory
-from learned.calibration import AXES, consistency, inside, mean_interval, nees, negative_log_likelihood
-from learned.covariance import hypothesis_spread, pose_errors
+from fusion_io.records import FloatArray, IntArray, PairEstimate, Trajectory
+from learned.calibration import AXES, consistency, inside, mean_interval, negative_log_likelihood
+from learned.covariance import hypothesis_spread, nees, pose_errors
 from learned.estimator import Inference
 from learned.scores import error_norms, hypothesis_matrices, mean_motion, mean_poses, score
 
 DEFAULT = "refined"
 """The estimate that `fusion.run` uses unless told otherwise: the figures at the top are its own."""
-
-MAX_GROUND_TRUTH_GAP_S = 1.0
-"""A hole in the ground truth longer than this is not bridged by interpolation (as in `fusion.evaluation`)."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def compare(inferences: Sequence[Inference], truth: Trajectory) -> Comparison:
     Raises LogError, with no file named, where there is none.
     """
     stamps = np.array([(i.pair.source_stamp_ns, i.pair.target_stamp_ns) for i in inferences]).reshape(-1, 2)
-    known = spans(truth, stamps[:, 0]) & spans(truth, stamps[:, 1])
+    known = truth.covers(stamps[:, 0]) & truth.covers(stamps[:, 1])
     if not known.any():
         raise LogError(f"none of its {len(inferences)} estimated pairs lies within the ground truth's stamps")
     spanned = [inference for inference, judged in zip(inferences, known, strict=True) if judged]
@@ -91,18 +88,6 @@ def compare(inferences: Sequence[Inference], truth: Trajectory) -> Comparison:
         refined=Estimates.of([i.pair for i in spanned]),
         was_refined=np.array([i.refined for i in spanned]),
     )
-
-
-def spans(truth: Trajectory, stamps_ns: IntArray) -> NDArray[np.bool_]:
-    """Which stamps (N,) lie between two poses that are close enough in time to interpolate."""
-    if len(truth) < 2:
-        return np.zeros(len(stamps_ns), dtype=np.bool_)
-    known = truth.stamps_ns
-    after = np.searchsorted(known, stamps_ns).clip(1, len(known) - 1)
-    gap_ns = known[after] - known[after - 1]
-    inside = (known[0] <= stamps_ns) & (stamps_ns <= known[-1])
-    exact = (stamps_ns == known[after]) | (stamps_ns == known[after - 1])
-    return np.asarray(inside & (exact | (gap_ns <= MAX_GROUND_TRUTH_GAP_S * NANOSECONDS)))
 
 
 def figures(comparison: Comparison) -> dict[str, Any]:

@@ -21,12 +21,11 @@ from learned.calibration import (
     coverage_bounds,
     inside,
     mean_interval,
-    nees,
     rank_correlation,
     standard_deviations,
 )
 from learned.comparison import DEFAULT, Comparison
-from learned.covariance import hypothesis_spread
+from learned.covariance import hypothesis_spread, nees
 from learned.scores import error_norms, mean_poses
 
 COLOURS = {"network": "#0072B2", "refined": "#D55E00"}

@@ -112,14 +112,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="sim, sim:CLIPS or an MCAP log with images and depth; several make a mixture, in which a pair of weight 2 "
         "is drawn twice as often as one of weight 1 (default: sim)",
     )  # fmt: skip
-    parser.add_argument("--steps", type=_positive, help="number of optimiser steps (default: the preset's)")
-    parser.add_argument("--batch", type=_positive, help="pairs a step (default: the preset's)")
+    parser.add_argument("--steps", type=positive_integer, help="number of optimiser steps (default: the preset's)")
+    parser.add_argument("--batch", type=positive_integer, help="pairs a step (default: the preset's)")
     parser.add_argument(
-        "--calibration-clips", type=_positive, help="simulated clips to fit the covariance on (default: the preset's)"
+        "--calibration-clips",
+        type=positive_integer,
+        help="simulated clips to fit the covariance on (default: the preset's)",
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=_positive, help="processes that render (default: one a core)")
-    parser.add_argument("--threads", type=_positive, help="threads of the training itself (default: torch's)")
+    parser.add_argument("--workers", type=positive_integer, help="processes that render (default: one a core)")
+    parser.add_argument("--threads", type=positive_integer, help="threads of the training itself (default: torch's)")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument(
         "--precision", choices=("auto", "float32", "bf16"), default="auto",
@@ -334,10 +336,11 @@ def _source(text: str) -> Source:
     kind, colon, clips = name.partition(":")
     if kind != "sim":
         return Source(Path(name), weight=weight)
-    return Source(clips=_positive(clips) if colon else None, weight=weight)
+    return Source(clips=positive_integer(clips) if colon else None, weight=weight)
 
 
-def _positive(text: str) -> int:
+def positive_integer(text: str) -> int:
+    """A number of steps, clips or threads on the command line."""
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
     return int(text)

@@ -12,10 +12,10 @@ from learned.calibration import (
     coverage_bounds,
     inside,
     mean_interval,
-    nees,
     negative_log_likelihood,
     rank_correlation,
 )
+from learned.covariance import nees
 
 COUNT = 4000
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, PairEstimate, Trajectory
 from learned.calibration import AXES
-from learned.comparison import compare, figures, spans
+from learned.comparison import compare, figures
 from learned.estimator import Inference
 
 TENTH = NANOSECONDS // 10
@@ -109,7 +109,7 @@ def test_pairs_outside_the_ground_truth_are_not_judged() -> None:
 def test_pairs_in_a_long_hole_of_the_ground_truth_are_not_judged() -> None:
     truth = _truth([0, TENTH, 2 * TENTH, 3 * NANOSECONDS, 3 * NANOSECONDS + TENTH])
     stamps = np.array([0, TENTH, 2 * TENTH, 3 * TENTH, 3 * NANOSECONDS, 3 * NANOSECONDS + TENTH // 2])
-    assert spans(truth, stamps).tolist() == [True, True, True, False, True, True]
+    assert truth.covers(stamps).tolist() == [True, True, True, False, True, True]
 
 
 @pytest.mark.parametrize("stamps_ns", [[0], [99 * NANOSECONDS, 100 * NANOSECONDS]])

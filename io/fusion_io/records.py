@@ -23,6 +23,9 @@ IntArray = NDArray[np.int64]
 
 NANOSECONDS = 1_000_000_000
 
+LONGEST_INTERPOLATION_S = 1.0
+"""A hole in a trajectory longer than this is not bridged by interpolation."""
+
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
@@ -149,6 +152,17 @@ class Trajectory:
         at = (stamps_ns - self.stamps_ns[0]) / NANOSECONDS
         position = np.stack([np.interp(at, t, axis) for axis in self.poses.translation.T], axis=-1)
         return RigidTransform.from_components(position, Slerp(t, self.poses.rotation)(at))
+
+    def covers(self, stamps_ns: IntArray) -> NDArray[np.bool_]:
+        """Which stamps (M,) lie on a pose, or between two that are close enough in time to interpolate."""
+        known = self.stamps_ns
+        if len(known) < 2:
+            return np.zeros(len(stamps_ns), dtype=np.bool_)
+        after = np.clip(np.searchsorted(known, stamps_ns), 1, len(known) - 1)
+        inside = (stamps_ns >= known[0]) & (stamps_ns <= known[-1])
+        exact = (stamps_ns == known[after]) | (stamps_ns == known[after - 1])
+        near = known[after] - known[after - 1] <= LONGEST_INTERPOLATION_S * NANOSECONDS
+        return np.asarray(inside & (exact | near))
 
     def relative_to_first(self) -> Trajectory:
         """The same trajectory in the frame of its first pose (covariances are in body axes: kept)."""
