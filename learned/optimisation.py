@@ -148,8 +148,8 @@ def optimise(
     optimiser = adam(model, descent)
     checkpoint = out / "checkpoint.pt"
     state = restore(checkpoint, model, optimiser, device) if checkpoint.exists() else State()
-    write_curve(out / "curve.csv", state.curve)
     with interruption() as stop:
+        write_curve(out / "curve.csv", state.curve)  # whoever sees it may interrupt
         batches = ahead(
             lambda s: draw_batch(training, descent, seed, s, device), range(state.step, descent.steps), drawers
         )
