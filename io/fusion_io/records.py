@@ -170,6 +170,35 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True)
+class EstimatorSeries:
+    """What a back end estimated beside the poses, a row for each of N frames; NaN where it has nothing to say.
+
+    stamps_ns (N,). In IMU axes: gyro_bias (N, 3) rad/s and accelerometer_bias (N, 3) m/s^2. Of the front end:
+    scale_error (N,), by which its translations are too long (0.01 is 1 %), and rate_bias (N, 3) rad/s in camera axes,
+    by which it turns too fast. *_std: standard deviations, of the same shapes. innovation (N, 6): what the pair that
+    ends at the frame shows beyond what was predicted, rotation (rad) first, then translation (m), in the axes of the
+    target camera; nis (N,): its square, normalised by its covariance, 6 on average where all is modelled right. used
+    (N,): False where that pair was rejected.
+    """
+
+    stamps_ns: IntArray
+    gyro_bias: FloatArray
+    gyro_bias_std: FloatArray
+    accelerometer_bias: FloatArray
+    accelerometer_bias_std: FloatArray
+    scale_error: FloatArray
+    scale_error_std: FloatArray
+    rate_bias: FloatArray
+    rate_bias_std: FloatArray
+    innovation: FloatArray
+    nis: FloatArray
+    used: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True)
 class GnssFix:
     """A position on the WGS84 ellipsoid: degrees, degrees, metres; covariance (3, 3) m^2 in ENU."""
 

@@ -1,0 +1,46 @@
+"""What the back ends are given, and what they give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.imu import ImuCalibration
+from fusion_io.records import EstimatorSeries, GnssFix, ImuSeries, PairEstimate, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """All that is known about one motion of the camera.
+
+    steps: pair estimates that follow each other without holes (`chain.bridge_gaps`). imu: samples in the IMU's own axes
+    and time, and calibration: how they relate to the camera; both None where there is no IMU to be used. skips: pair
+    estimates between frames of the same steps that are further apart. loops: the same between frames where the camera
+    came back. gnss: positions of the antenna.
+    """
+
+    steps: Sequence[PairEstimate]
+    imu: ImuSeries | None = None
+    calibration: ImuCalibration | None = None
+    skips: Sequence[PairEstimate] = ()
+    loops: Sequence[PairEstimate] = ()
+    gnss: Sequence[GnssFix] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What a back end makes of the measurements.
+
+    trajectory: with the covariance of every pose. note: one line on how the measurements were used. rejected: how many
+    of them were left out as outliers. series: what was estimated beside the poses. loops_used (M,): which of the loops
+    were believed; empty for a back end that takes none.
+    """
+
+    trajectory: Trajectory
+    note: str
+    rejected: int = 0
+    series: EstimatorSeries | None = None
+    loops_used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
