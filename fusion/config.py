@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from difflib import get_close_matches
 from math import hypot
 from pathlib import Path
@@ -13,10 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 
 from fusion.evaluation import KITTI_SEGMENT_LENGTHS_M
 from fusion_io.errors import UsageError
+from fusion_io.records import PairEstimate
 
 Backend = Literal["posegraph", "ekf", "both"]
 FrontendMode = Literal["auto", "violearner", "recorded"]
 Record = Literal["light", "all"]
+Robust = Literal["gnc", "huber", "none"]
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
 
 
 class Section(BaseModel):
@@ -73,60 +79,135 @@ class ImuConfig(Section):
         return quat
 
 
-class PoseGraphConfig(Section):
-    """The pose graph back end.
+class FusionConfig(Section):
+    """What both back ends assume of the sensors.
 
-    The noise of the IMU is that of consumer devices, widened by what the model leaves out: gyro_noise (rad/s/sqrt(Hz))
-    by errors of mounting and time, accelerometer_noise (m/s^2/sqrt(Hz)) by the unknown lever arm to the camera and by
-    errors of the pairs that are correlated in time. *_bias_walk: how biases wander (rad/s^2, m/s^3, per sqrt(Hz)).
-    *_bias_sigma: how far they may be from zero (rad/s, m/s^2); corrected_gyro_bias_sigma where a navigation system
-    has removed the gyro's already. pair_rotation_rate_sigma (rad/s): constant rate errors that a front end is taken
-    to be capable of. gate_probability: how seldom noise alone makes IMU and pair contradict each other over one step.
+    The noise of the IMU is that of consumer devices, widened by what the models leave out (vibration, for one):
+    gyro_noise (rad/s/sqrt(Hz)), accelerometer_noise (m/s^2/sqrt(Hz)). *_bias_walk: how biases wander (rad/s^2, m/s^3,
+    per sqrt(Hz)). *_bias_sigma (rad/s, m/s^2): how far they are from what the calibration found.
+
+    Errors of a front end are correlated in time: beside the covariance of each pair estimate it has a scale error
+    (pair_scale_sigma; learned_pair_scale_sigma where the network made the pairs, whose scale is that of the depth) and
+    a rate bias (pair_rate_bias_sigma, rad/s) that change over *_correlation_s, and a constant misalignment of its
+    rotations against its translations (pair_misalignment_sigma, rad).
+
+    lever_arm_sigma (m): how far the IMU may be from the camera. gate_probability: how seldom noise alone takes a
+    measurement for an outlier.
     """
 
     gyro_noise: PositiveFloat = 1e-3
-    accelerometer_noise: PositiveFloat = 0.5
-    gyro_bias_walk: PositiveFloat = 1e-5
-    accelerometer_bias_walk: PositiveFloat = 1e-4
-    gyro_bias_sigma: PositiveFloat = 1e-2
-    corrected_gyro_bias_sigma: PositiveFloat = 2e-4
-    accelerometer_bias_sigma: PositiveFloat = 0.2
-    pair_rotation_rate_sigma: PositiveFloat = 3e-4
-    gate_probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
-
-
-class EkfConfig(Section):
-    """The error-state Kalman filter back end.
-
-    The noise of the IMU is that of consumer devices, widened by what the filter leaves out. gyro_noise
-    (rad/s/sqrt(Hz)): also errors of mounting and time. accelerometer_noise (m/s^2/sqrt(Hz)): also the unknown lever
-    arm to the camera. *_bias_walk (rad/s^2, m/s^3, per sqrt(Hz)): how biases wander; *_bias_sigma (rad/s, m/s^2): how
-    far they are from zero at first, the gyro's once the calibration has removed what it could see. gravity_sigma (rad):
-    of its direction at first, which accelerations hide. velocity_sigma (m/s): at first, when nothing is known of it.
-
-    Errors of a front end are correlated in time: beside the covariance of each pair estimate, it has a rate bias
-    (pair_rate_bias_sigma, rad/s) and a scale error (pair_scale_sigma) that change over pair_correlation_s.
-
-    angular_acceleration (rad/s^2/sqrt(Hz)) and acceleration (m/s^2/sqrt(Hz)): how the motion strays from a constant one
-    where no IMU measures it. gate_probability: how seldom noise alone rejects a pair estimate; after
-    max_rejected_in_a_row the prediction is taken to be wrong instead, and the pairs are believed until both agree.
-    """
-
-    gyro_noise: PositiveFloat = 5e-4
-    accelerometer_noise: PositiveFloat = 1.0
+    accelerometer_noise: PositiveFloat = 0.05
     gyro_bias_walk: PositiveFloat = 1e-5
     accelerometer_bias_walk: PositiveFloat = 1e-4
     gyro_bias_sigma: PositiveFloat = 2e-4
-    accelerometer_bias_sigma: PositiveFloat = 0.1
+    accelerometer_bias_sigma: PositiveFloat = 0.2
+    pair_scale_sigma: PositiveFloat = 0.02
+    learned_pair_scale_sigma: PositiveFloat = 0.005
+    pair_scale_correlation_s: PositiveFloat = 10.0
+    pair_rate_bias_sigma: PositiveFloat = 3e-3
+    pair_rate_bias_correlation_s: PositiveFloat = 5.0
+    pair_misalignment_sigma: PositiveFloat = 1e-2
+    lever_arm_sigma: PositiveFloat = 1.0
+    gate_probability: Probability = 1e-6
+
+    def scale_sigma(self, pairs: Sequence[PairEstimate]) -> float:
+        """That of the front end that made the pairs."""
+        return self.learned_pair_scale_sigma if any(pair.winner >= 0 for pair in pairs) else self.pair_scale_sigma
+
+
+class PoseGraphConfig(FusionConfig):
+    """The pose graph back end.
+
+    *_sigma of the mounting (rad) and the time offset (s): of those that are estimated from the log, whose pairs are in
+    the graph anyway, and of those that are given. unknown_acceleration (m/s^2/sqrt(Hz)): how the velocity strays where
+    no IMU measures it. robust: what becomes of measurements that contradict the others: gnc leaves them out (graduated
+    non-convexity), huber believes them less, none believes all.
+    """
+
+    mounting_sigma: PositiveFloat = 0.5
+    given_mounting_sigma: PositiveFloat = 1e-2
+    time_offset_sigma: PositiveFloat = 0.1
+    given_time_offset_sigma: PositiveFloat = 1e-3
+    unknown_acceleration: PositiveFloat = 5.0
+    robust: Robust = "gnc"
+
+
+class EkfConfig(FusionConfig):
+    """The error-state Kalman filter back end.
+
+    Its accelerometer_noise is larger than that of the pose graph: what accelerations tell of scale and attitude is true
+    over many seconds, and a filter would believe it at once. mounting_sigma (rad), time_offset_sigma (s): where the
+    pose graph has not refined them. gravity_sigma (rad): of its direction at first, which accelerations hide.
+    velocity_sigma (m/s): at first, when nothing is known of it. stamp_jitter_s: how far a frame's stamp may be from
+    when it was taken.
+
+    angular_acceleration (rad/s^2/sqrt(Hz)) and acceleration (m/s^2/sqrt(Hz)): how the motion strays from a constant one
+    where no IMU measures it. After max_rejected_in_a_row pairs were rejected the prediction is taken to be wrong
+    instead, and the pairs are believed until both agree.
+    """
+
+    accelerometer_noise: PositiveFloat = 1.0
+    pair_scale_sigma: PositiveFloat = 0.025
+    pair_scale_correlation_s: PositiveFloat = 30.0
+    mounting_sigma: PositiveFloat = 6e-3
+    time_offset_sigma: PositiveFloat = 5e-3
     gravity_sigma: PositiveFloat = 0.3
     velocity_sigma: PositiveFloat = 30.0
-    pair_rate_bias_sigma: PositiveFloat = 2e-3
-    pair_scale_sigma: PositiveFloat = 0.02
-    pair_correlation_s: PositiveFloat = 30.0
+    stamp_jitter_s: NotNegative = 2e-3
     angular_acceleration: PositiveFloat = 1.0
     acceleration: PositiveFloat = 5.0
-    gate_probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
     max_rejected_in_a_row: Annotated[int, Field(ge=0)] = 5
+
+
+class RetrievalConfig(Section):
+    """Where loops are looked for.
+
+    Keyframes: the first frame that is keyframe_distance_m or keyframe_angle_deg away from the keyframe before. Two of
+    them are compared where min_time_s and min_path_m lie between. candidates: for each keyframe, so many of the places
+    that look most alike, and so many of those that the trajectory puts near: places are near_m plus near_sigmas
+    standard deviations apart or less, and their views less than near_angle_deg; two places are place_m of path apart.
+    max_drift: share of the path between two frames that the trajectory may be wrong by.
+    """
+
+    keyframe_distance_m: PositiveFloat = 2.0
+    keyframe_angle_deg: PositiveFloat = 10.0
+    min_time_s: PositiveFloat = 10.0
+    min_path_m: PositiveFloat = 20.0
+    candidates: Annotated[int, Field(ge=1)] = 2
+    near_m: PositiveFloat = 5.0
+    near_sigmas: PositiveFloat = 3.0
+    near_angle_deg: PositiveFloat = 60.0
+    place_m: PositiveFloat = 10.0
+    max_drift: NotNegative = 0.1
+
+
+class LoopsConfig(Section):
+    """What counts as a loop; with find = false only those that the log has recorded do.
+
+    By features, in both directions: match_ratio, a match is nearer than this times the second nearest; reprojection_px,
+    further off it is an outlier; min_inliers, min_inlier_share (of the matches), min_spread (share of the image that
+    their convex hull covers). max_distance_m: between the cameras. By all that both frames see: min_overlap, share of
+    the source's pixels that the target sees; min_depth, share of those that are where the target sees them, to
+    depth_tolerance (relative); min_correlation, of their brightness. gate_probability: how seldom noise alone makes
+    the two directions, or features and refinement, contradict each other. rotation_floor_deg, translation_floor_m:
+    standard deviations that no loop falls below; those of depth from stereo, which residuals do not show.
+    """
+
+    find: bool = True
+    retrieval: RetrievalConfig = RetrievalConfig()
+    match_ratio: Share = 0.8
+    reprojection_px: PositiveFloat = 2.0
+    min_inliers: Annotated[int, Field(ge=12)] = 20
+    min_inlier_share: Share = 0.5
+    min_spread: Share = 0.1
+    max_distance_m: PositiveFloat = 10.0
+    min_overlap: Share = 0.2
+    min_depth: Share = 0.6
+    min_correlation: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.5
+    depth_tolerance: PositiveFloat = 0.1
+    gate_probability: Probability = 1e-6
+    rotation_floor_deg: PositiveFloat = 0.1
+    translation_floor_m: PositiveFloat = 0.05
 
 
 class RunConfig(Section):
@@ -140,6 +221,7 @@ class RunConfig(Section):
     imu: ImuConfig = ImuConfig()
     posegraph: PoseGraphConfig = PoseGraphConfig()
     ekf: EkfConfig = EkfConfig()
+    loops: LoopsConfig = LoopsConfig()
 
 
 def load(path: Path | None, overrides: dict[str, Any]) -> RunConfig:

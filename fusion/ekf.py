@@ -1,17 +1,20 @@
-"""The filter back end: an error-state Kalman filter on the manifold, with a clone of the pose of the last frame.
+"""The filter back end: an error-state Kalman filter on the manifold, with a clone of the pose at the last frame.
 
 The nominal state lives outside the filter, which estimates its error (filterpy): the IMU moves the nominal state and
 spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
 moved into the nominal state; then the present pose becomes the clone. Everything is causal.
 
-Error state (26): attitude, position, velocity, gyro bias, accelerometer bias, direction of gravity (2), rate bias of
-the pairs, attitude and position of the clone. Attitudes err on the right, R = R_nominal Exp(error); all else adds.
-Gravity is Q e3 times its magnitude, so that only two errors of the rotation Q are felt. The world is the first camera's
-frame.
+Error state (37): attitude, position, velocity, gyro bias, accelerometer bias, direction of gravity (2), scale error and
+rate bias of the front end (4), mounting, lever arm, time offset and misalignment (10), attitude and position of the
+clone. They are those of the pose graph; what a pair shows of them is in `fusion.pair_model`. Poses are those of the
+IMU, attitudes err on the right, R = R_nominal Exp(error); all else adds. Gravity is Q e3 times its magnitude, so that
+only two errors of the rotation Q are felt. The world is the first camera's frame. Without an IMU its axes are the
+camera's.
 
-The front end's errors are correlated in time. Its rate bias is a state while an IMU measures, for gyro and gravity can
-tell it. Its scale error is not: accelerations tell too little of it, and what they tell would throw the position about.
-What it does to the position is carried along beside the filter and added to the covariance.
+What a filter learns late, of scale or gravity, moves its position by what it got wrong all the way before. A trajectory
+whose past stays where it was must not jump by that: its positions are the sum of the motions as they were known when
+they happened (the trail), and the covariance of that sum is carried along exactly, as that of a state which no update
+moves (Schmidt, "Application of state-space methods to navigation problems", 1966).
 
 Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (error state, reset); Roumeliotis and Burdick,
 "Stochastic cloning", 2002.
@@ -19,7 +22,6 @@ Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (error sta
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import NamedTuple
@@ -32,42 +34,25 @@ from scipy.stats import chi2
 
 from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import EkfConfig
-from fusion_io.records import FloatArray, ImuSeries, PairEstimate, Trajectory
+from fusion.imu import ImuCalibration
+from fusion.measurements import Estimate, Measurements, Mounting
+from fusion.pair_model import Prediction, camera, difference, exp, predict, right_jacobian, skew
+from fusion.standstill import STILL_SIGMA, standing_still
+from fusion_io.records import EstimatorSeries, FloatArray, PairEstimate, Trajectory
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
-PAIR_RATE_BIAS = slice(17, 20)
-CLONE_ATTITUDE, CLONE_POSITION = slice(20, 23), slice(23, 26)
-DIMENSION = 26
-
-# The cross products with the three unit vectors.
-GENERATORS = np.array(
-    [[[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0.0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]]
-)
+FRONT_END = slice(17, 21)  # scale error, rate bias
+MOUNTING, LEVER_ARM, TIME_OFFSET, MISALIGNMENT = slice(21, 24), slice(24, 27), slice(27, 28), slice(28, 31)
+EXTRINSICS, MOUNTED = slice(21, 28), slice(21, 31)
+CLONE_ATTITUDE, CLONE_POSITION = slice(31, 34), slice(34, 37)
+DIMENSION = 37
 
 # Two small turns of Q move its third column so: Exp(x, y, 0) e3 = e3 + TILT (x, y).
 TILT = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
-
-
-@dataclass(frozen=True, slots=True)
-class EkfResult:
-    """The filtered trajectory and how the filter fared.
-
-    rejected: pair estimates that the gate refused. nis (N,): normalised innovation squared of each step, 6 on average
-    where all is modelled right. note: one line on what predicted the motion. gyro_bias
-    (3,) rad/s and accelerometer_bias (3,) m/s^2 at the end, in camera axes; gravity (3,) m/s^2 in the world.
-    """
-
-    trajectory: Trajectory
-    rejected: int
-    nis: FloatArray
-    note: str
-    gyro_bias: FloatArray
-    accelerometer_bias: FloatArray
-    gravity: FloatArray
 
 
 class Measurement(NamedTuple):
@@ -82,19 +67,26 @@ class Measurement(NamedTuple):
 class State:
     """The nominal state.
 
-    R (3, 3), p, v (3,): pose and velocity in the world; gyro_bias (rad/s), accelerometer_bias (m/s^2), pair_rate_bias
-    (rad/s) (3,) in camera axes; Q (3, 3), whose third column points down; R_clone, p_clone: the pose of the last frame.
+    R (3, 3), p, v (3,): pose and velocity of the IMU in the world; rate (3,) rad/s: of its turning, in its own axes;
+    gyro_bias (rad/s), accelerometer_bias (m/s^2) (3,) in its axes; Q (3, 3), whose third column points down; front_end
+    (4,): scale error and rate bias (rad/s); T_camera_imu (4, 4); ahead_s: how much further ahead the IMU's clock is
+    than was thought; misalignment (3,) rad; clone (4, 4), clone_twist (6,): pose and twist of the IMU at the last
+    frame.
     """
 
     R: FloatArray
     p: FloatArray
     v: FloatArray
+    rate: FloatArray
     gyro_bias: FloatArray
     accelerometer_bias: FloatArray
     Q: FloatArray
-    pair_rate_bias: FloatArray
-    R_clone: FloatArray
-    p_clone: FloatArray
+    front_end: FloatArray
+    T_camera_imu: FloatArray
+    ahead_s: float
+    misalignment: FloatArray
+    clone: FloatArray
+    clone_twist: FloatArray
 
     @property
     def gravity(self) -> FloatArray:
@@ -102,23 +94,34 @@ class State:
         return GRAVITY * self.Q[:, 2]
 
     @property
-    def motion(self) -> FloatArray:
-        """T_clone_now (4, 4)."""
-        motion = np.eye(4)
-        motion[:3, :3] = self.R_clone.T @ self.R
-        motion[:3, 3] = self.R_clone.T @ (self.p - self.p_clone)
-        return motion
+    def pose(self) -> FloatArray:
+        """T_world_imu (4, 4)."""
+        return pose(self.R, self.p)
 
-    def shown(self, seconds: float) -> FloatArray:
-        """What a pair estimate over that time shows of the motion (4, 4): it turns by the rate bias too much."""
-        shown = self.motion
-        shown[:3, :3] = shown[:3, :3] @ exp(self.pair_rate_bias * seconds)
-        return shown
+    @property
+    def twist(self) -> FloatArray:
+        """(6,) of the IMU in its own axes, rotation first."""
+        return np.concatenate([self.rate, self.R.T @ self.v])
+
+    def shown(self, seconds: float) -> Prediction:
+        """What a pair estimate from the clone to now would show."""
+        return predict(
+            self.clone[None],
+            self.pose[None],
+            self.T_camera_imu,
+            (self.clone_twist[None], self.twist[None]),
+            self.ahead_s,
+            self.misalignment,
+            self.front_end[None],
+            np.array([seconds]),
+        )
 
 
-def exp(vectors: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
-    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+def pose(R: FloatArray, p: FloatArray) -> FloatArray:
+    """The rigid transform (4, 4) of a rotation (3, 3) and a position (3,)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, p
+    return T
 
 
 def log(matrix: FloatArray) -> FloatArray:
@@ -126,24 +129,8 @@ def log(matrix: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
 
 
-def skew(vectors: FloatArray) -> FloatArray:
-    """The matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
-    return np.tensordot(vectors, GENERATORS, axes=1)
-
-
-def right_jacobian(vectors: FloatArray) -> FloatArray:
-    """J (..., 3, 3) of Exp(vector + d) = Exp(vector) Exp(J d), to first order in d (Sola, eq. 183)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    small = angle < 1e-3  # there the terms of the series that are left out are below rounding
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5 - angle**2 / 24, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    cross = skew(vectors)
-    return np.asarray(np.eye(3) - first * cross + second * cross @ cross)
-
-
 def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
-    """The state after M pieces of IMU, and the Jacobians (M, 26, 26) of its error from piece to piece.
+    """The state after M pieces of IMU, and the Jacobians (M, 37, 37) of its error from piece to piece.
 
     Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it.
     """
@@ -168,73 +155,110 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
     F[:, VELOCITY, GRAVITY_DIRECTION] = GRAVITY * state.Q @ TILT * dt
     F[:, POSITION] += F[:, VELOCITY] * (dt / 2)
     F[:, POSITION, VELOCITY] = np.eye(3) * dt
-    return replace(state, R=R[-1], p=p, v=v[-1]), F
+    rate = window.angular_velocity[-1] - state.gyro_bias
+    return replace(state, R=R[-1], p=p, v=v[-1], rate=rate), F
 
 
-def shown_jacobian(state: State, seconds: float) -> FloatArray:
-    """H (6, 26): how what a pair estimate over that time shows changes with the error, as a right perturbation."""
-    turn = state.pair_rate_bias * seconds
-    R_shown = state.shown(seconds)[:3, :3]
+def shown_jacobian(state: State, shown: Prediction) -> FloatArray:
+    """H (6, 37): how what a pair estimate shows changes with the error, as a right perturbation."""
     H = np.zeros((6, DIMENSION))
-    H[:3, ATTITUDE] = exp(-turn)
-    H[:3, CLONE_ATTITUDE] = -R_shown.T
-    H[:3, PAIR_RATE_BIAS] = right_jacobian(turn) * seconds
-    H[3:, POSITION] = exp(-turn) @ state.R.T
-    H[3:, CLONE_POSITION] = -H[3:, POSITION]
-    H[3:, CLONE_ATTITUDE] = R_shown.T @ skew(state.motion[:3, 3])
+    H[:, ATTITUDE] = shown.by_target[0, :, :3]
+    H[:, POSITION] = shown.by_target[0, :, 3:] @ state.R.T
+    H[:, CLONE_ATTITUDE] = shown.by_source[0, :, :3]
+    H[:, CLONE_POSITION] = shown.by_source[0, :, 3:] @ state.clone[:3, :3].T
+    H[:, FRONT_END] = shown.by_front_end[0]
+    H[:, EXTRINSICS] = shown.by_extrinsics[0]
+    H[:, MISALIGNMENT] = shown.by_misalignment[0]
     return H
 
 
-def difference(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """The innovation (6,) of two motions (4, 4), Log(predicted^-1 measured) to first order, rotation first."""
-    R = predicted[:3, :3].T
-    return np.concatenate([log(R @ measured[:3, :3]), R @ (measured[:3, 3] - predicted[:3, 3])])
-
-
 def inject(state: State, error: FloatArray) -> State:
-    """The state with an error (26,) moved into it."""
-    return State(
+    """The state with an error (37,) moved into it."""
+    return replace(
+        state,
         R=state.R @ exp(error[ATTITUDE]),
         p=state.p + error[POSITION],
         v=state.v + error[VELOCITY],
         gyro_bias=state.gyro_bias + error[GYRO_BIAS],
         accelerometer_bias=state.accelerometer_bias + error[ACCELEROMETER_BIAS],
         Q=state.Q @ exp(np.append(error[GRAVITY_DIRECTION], 0.0)),
-        pair_rate_bias=state.pair_rate_bias + error[PAIR_RATE_BIAS],
-        R_clone=state.R_clone @ exp(error[CLONE_ATTITUDE]),
-        p_clone=state.p_clone + error[CLONE_POSITION],
+        front_end=state.front_end + error[FRONT_END],
+        T_camera_imu=state.T_camera_imu @ pose(exp(error[MOUNTING]), error[LEVER_ARM]),
+        ahead_s=state.ahead_s + float(error[TIME_OFFSET][0]),
+        misalignment=state.misalignment + error[MISALIGNMENT],
+        clone=pose(state.clone[:3, :3] @ exp(error[CLONE_ATTITUDE]), state.clone[:3, 3] + error[CLONE_POSITION]),
     )
 
 
 def reset_jacobian(error: FloatArray) -> FloatArray:
-    """(26, 26): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
+    """(37, 37): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
     G = np.eye(DIMENSION)
-    turns = np.stack([error[ATTITUDE], np.append(error[GRAVITY_DIRECTION], 0.0), error[CLONE_ATTITUDE]])
-    G[ATTITUDE, ATTITUDE], of_gravity, G[CLONE_ATTITUDE, CLONE_ATTITUDE] = right_jacobian(turns)
+    turns = [error[ATTITUDE], np.append(error[GRAVITY_DIRECTION], 0.0), error[CLONE_ATTITUDE], error[MOUNTING]]
+    attitude, of_gravity, clone, mounting = right_jacobian(np.stack(turns))
+    G[ATTITUDE, ATTITUDE], G[CLONE_ATTITUDE, CLONE_ATTITUDE], G[MOUNTING, MOUNTING] = attitude, clone, mounting
     G[GRAVITY_DIRECTION, GRAVITY_DIRECTION] = of_gravity[:2, :2]
+    G[LEVER_ARM, LEVER_ARM] = exp(error[MOUNTING]).T  # it moves along axes that have turned
     return G
 
 
 class Filter:
     """The nominal state, and the covariance of its error in filterpy's filter, through prediction and update."""
 
-    def __init__(self, config: EkfConfig, gyro_bias_std: float = 0.0) -> None:
+    def __init__(
+        self, config: EkfConfig, calibration: ImuCalibration | None, mounting: Mounting | None, scale_sigma: float
+    ) -> None:
         self.config = config
-        eye, zero = np.eye(3), np.zeros(3)
-        self.state = State(eye, zero, zero, zero, zero, eye, zero, eye, zero)
-        self.rate = zero  # rad/s in the last step, by which a step without an IMU is predicted to go on
-        self.knows_gravity = False
-        sigma = np.zeros(DIMENSION)  # the first pose is the world itself, and so is its clone
+        zero = np.zeros(3)
+        T_camera_imu, gyro_bias = np.eye(4), zero
+        sigma = np.zeros(DIMENSION)
         sigma[VELOCITY] = config.velocity_sigma
-        sigma[GYRO_BIAS] = np.hypot(config.gyro_bias_sigma, gyro_bias_std)
-        sigma[ACCELEROMETER_BIAS] = config.accelerometer_bias_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
-        sigma[PAIR_RATE_BIAS] = config.pair_rate_bias_sigma
+        if calibration is not None:
+            T_camera_imu[:3, :3] = calibration.mounting.inv().as_matrix()
+            gyro_bias = calibration.gyro_bias
+            sigma[GYRO_BIAS] = np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)
+            sigma[ACCELEROMETER_BIAS] = config.accelerometer_bias_sigma
+            sigma[MOUNTING] = np.hypot(config.mounting_sigma, calibration.rotation_std_rad)
+            sigma[LEVER_ARM] = config.lever_arm_sigma
+            sigma[TIME_OFFSET] = np.hypot(config.time_offset_sigma, calibration.time_offset_std_s)
+            sigma[MISALIGNMENT] = config.pair_misalignment_sigma
+        ahead_s, misalignment = 0.0, zero
+        if mounting is not None:
+            T_camera_imu, ahead_s, misalignment = mounting.T_camera_imu, mounting.ahead_s, mounting.misalignment
+        self.front_end_sigma = np.repeat([scale_sigma, config.pair_rate_bias_sigma], [1, 3])
+        sigma[FRONT_END] = self.front_end_sigma
+        P = np.diag(sigma**2)
+        if mounting is not None:
+            P[MOUNTED, MOUNTED] = mounting.covariance
+        self.front_end_s = np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3])
+        R, p = T_camera_imu[:3, :3], T_camera_imu[:3, 3]
+        self.state = State(
+            R,
+            p,
+            zero,
+            zero,
+            gyro_bias,
+            zero,
+            np.eye(3),
+            np.zeros(4),
+            T_camera_imu,
+            ahead_s,
+            misalignment,
+            pose(R, p),
+            np.zeros(6),
+        )
+        self.knows_gravity = False
         self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
         self.kf.x = np.zeros(DIMENSION)
-        self.kf.P = np.diag(sigma**2)
-        # Covariance of the position error that the pairs' scale has caused (3), and of the scale error itself (1).
-        self.by_scale = np.diag([0.0, 0.0, 0.0, config.pair_scale_sigma**2])
+        # The first camera is the world itself, so that the IMU's first pose errs as its mounting does.
+        tie = np.eye(DIMENSION)
+        for attitude, position in ((ATTITUDE, POSITION), (CLONE_ATTITUDE, CLONE_POSITION)):
+            tie[attitude, MOUNTING] = np.eye(3)
+            tie[position, LEVER_ARM] = R
+        self.kf.P = tie @ P @ tie.T
+        self.trail = p  # of the IMU
+        self.trail_covariance = self.kf.P[POSITION, POSITION].copy()
+        self.trail_cross = self.kf.P[POSITION].copy()  # with the error of the state
         self.imu_walk = np.zeros(DIMENSION)
         self.imu_walk[ATTITUDE] = config.gyro_noise**2
         self.imu_walk[GYRO_BIAS] = config.gyro_bias_walk**2
@@ -244,44 +268,63 @@ class Filter:
         """Move on to the next frame: by what an IMU measured, or else by constant velocity and rate."""
         if window is not None:
             self._predict_by_imu(window)
-            self._drift(seconds)
         else:
             self._predict_by_constancy(seconds)
+        self._drift(seconds)
 
-    def squared_innovation(self, measured: Measurement) -> float:
-        """Squared Mahalanobis distance from prediction to measurement: chi-square of 6 degrees of freedom."""
-        H = shown_jacobian(self.state, measured.seconds)
-        innovation = difference(measured.motion, self.state.shown(measured.seconds))
-        return float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + measured.covariance, innovation))
+    def squared_innovation(self, measured: Measurement) -> tuple[FloatArray, float]:
+        """The innovation (6,), rotation first, and its squared Mahalanobis norm: chi-square of 6 degrees of freedom."""
+        shown = self.state.shown(measured.seconds)
+        H = shown_jacobian(self.state, shown)
+        innovation = difference(shown.motion, measured.motion[None])[0]
+        return innovation, float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + measured.covariance, innovation))
 
     def update(self, measured: Measurement) -> None:
         """Correct by a measurement since the clone (Joseph form), move the error into the state and reset it."""
+        shown = self.state.shown(measured.seconds)
         self.kf.update(
             measured.motion,
-            HJacobian=lambda _: shown_jacobian(self.state, measured.seconds),
-            Hx=lambda _: self.state.shown(measured.seconds),
+            HJacobian=lambda _: shown_jacobian(self.state, shown),
+            Hx=lambda _: shown.motion,
             R=measured.covariance,
-            residual=difference,
+            residual=lambda motion, prediction: difference(prediction, motion[None])[0],
         )
+        self._move_error(shown_jacobian(self.state, shown))
+
+    def stand_still(self) -> None:
+        """Correct by the knowledge that the IMU does not move (zero-velocity update)."""
+        H = np.zeros((3, DIMENSION))
+        H[:, VELOCITY] = np.eye(3)
+        self.kf.update(
+            np.zeros(3),
+            HJacobian=lambda _: H,
+            Hx=lambda _: self.state.v,
+            R=STILL_SIGMA**2 * np.eye(3),
+        )
+        self._move_error(H)
+
+    def _move_error(self, H: FloatArray) -> None:
+        """After an update by H (M, 37): move the error into the state, and reset it."""
         G = reset_jacobian(self.kf.x)
+        self.trail_cross = self.trail_cross @ (np.eye(DIMENSION) - self.kf.K @ H).T @ G.T
         P = G @ self.kf.P @ G.T
         self.kf.P = (P + P.T) / 2
         self.state = inject(self.state, self.kf.x)
         self.kf.x = np.zeros(DIMENSION)
 
-    def clone(self, seconds: float) -> None:
-        """Make the present pose the clone, which lies that time back; it errs as the present pose does."""
-        walk = np.diag([1.0, 1.0, 1.0, self._keep(seconds)])
-        walk[:3, 3] = self.state.p - self.state.p_clone
-        self.by_scale = walk @ self.by_scale @ walk.T
-        self.by_scale[3, 3] += (1.0 - self._keep(seconds) ** 2) * self.config.pair_scale_sigma**2
-
-        self.rate = log(self.state.motion[:3, :3]) / seconds
-        self.state = replace(self.state, R_clone=self.state.R, p_clone=self.state.p)
+    def clone(self) -> None:
+        """Add the motion since the clone to the trail, and make the present pose the clone; it errs as that does."""
+        self.trail = self.trail + self.state.p - self.state.clone[:3, 3]
+        added = self.kf.P[POSITION] - self.kf.P[CLONE_POSITION]
+        cross = self.trail_cross[:, POSITION] - self.trail_cross[:, CLONE_POSITION]
+        self.trail_covariance += cross + cross.T + added[:, POSITION] - added[:, CLONE_POSITION]
+        self.trail_cross = self.trail_cross + added
+        self.state = replace(self.state, clone=self.state.pose, clone_twist=self.state.twist)
         copy = np.eye(DIMENSION)
         copy[CLONE_ATTITUDE] = copy[ATTITUDE]
         copy[CLONE_POSITION] = copy[POSITION]
         self.kf.P = copy @ self.kf.P @ copy.T
+        self.trail_cross = self.trail_cross @ copy.T
 
     def forget_velocity(self) -> None:
         """Make the velocity as uncertain as at first, and independent of all else."""
@@ -289,13 +332,24 @@ class Filter:
         P[VELOCITY], P[:, VELOCITY] = 0.0, 0.0
         P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
         self.kf.P = P
+        self.trail_cross[:, VELOCITY] = 0.0
 
-    def pose_covariance(self) -> FloatArray:
-        """(6, 6) of the present pose, rotation first, right perturbation."""
-        P = self.kf.P[:6, :6].copy()
-        P[POSITION, POSITION] += self.by_scale[:3, :3]
-        to_body = block_diag(np.eye(3), self.state.R.T)
-        return np.asarray(to_body @ P @ to_body.T)
+    def camera(self) -> tuple[FloatArray, FloatArray]:
+        """The pose of the camera (4, 4) on the trail, and its covariance (6, 6), rotation first, right perturbation."""
+        state = self.state
+        on_trail = pose(state.R, self.trail)[None]
+        cameras, by_pose, by_extrinsics = camera(on_trail, state.T_camera_imu, state.twist[None], state.ahead_s)
+        J = np.zeros((6, DIMENSION))
+        J[:, ATTITUDE] = by_pose[0, :, :3]
+        J[:, EXTRINSICS] = by_extrinsics[0]
+        by_trail = by_pose[0, :, 3:] @ state.R.T
+        crossed = by_trail @ self.trail_cross @ J.T
+        of_trail = by_trail @ self.trail_covariance @ by_trail.T
+        return cameras[0], J @ self.kf.P @ J.T + crossed + crossed.T + of_trail
+
+    def std(self, part: slice) -> FloatArray:
+        """The standard deviations of a part of the error."""
+        return np.asarray(np.sqrt(np.diag(self.kf.P)[part]))
 
     def _predict_by_imu(self, window: ImuWindow) -> None:
         if not self.knows_gravity:
@@ -312,7 +366,7 @@ class Filter:
         self.knows_gravity = True
 
     def _predict_by_constancy(self, seconds: float) -> None:
-        turn = exp(self.rate * seconds)
+        turn = exp(self.state.rate * seconds)
         self.state = replace(self.state, R=self.state.R @ turn, p=self.state.p + self.state.v * seconds)
         F = np.eye(DIMENSION)
         F[ATTITUDE, ATTITUDE] = turn.T
@@ -320,27 +374,20 @@ class Filter:
         variances = np.zeros(DIMENSION)
         variances[ATTITUDE] = self.config.angular_acceleration**2 * seconds**3
         self._spread(F[None], variances[None], self.config.acceleration, np.array([seconds]))
-        # Nothing tells the rate bias of the pairs from turning now: they are taken as they are.
-        self.state = replace(self.state, pair_rate_bias=np.zeros(3))
-        self.kf.P[PAIR_RATE_BIAS], self.kf.P[:, PAIR_RATE_BIAS] = 0.0, 0.0
 
     def _drift(self, seconds: float) -> None:
-        """Let the rate bias of the pairs fade and wander: a Gauss-Markov process."""
-        keep = self._keep(seconds)
-        self.state = replace(self.state, pair_rate_bias=keep * self.state.pair_rate_bias)
+        """Let the lasting errors of the front end fade and wander: Gauss-Markov processes."""
+        keep = np.exp(-seconds / self.front_end_s)
+        self.state = replace(self.state, front_end=keep * self.state.front_end)
         factors, variances = np.ones(DIMENSION), np.zeros(DIMENSION)
-        factors[PAIR_RATE_BIAS] = keep
-        variances[PAIR_RATE_BIAS] = (1.0 - keep**2) * self.config.pair_rate_bias_sigma**2
+        factors[FRONT_END] = keep
+        variances[FRONT_END] = (1.0 - keep**2) * self.front_end_sigma**2
         self._spread(np.diag(factors)[None], variances[None], 0.0, np.array([seconds]))
 
-    def _keep(self, seconds: float) -> float:
-        """What is left of a correlated error of the pairs after that time."""
-        return float(np.exp(-seconds / self.config.pair_correlation_s))
-
     def _spread(self, jacobians: FloatArray, variances: FloatArray, acceleration: float, seconds: FloatArray) -> None:
-        """Move the covariance on over M pieces that last seconds (M,), with the jacobians (M, 26, 26) of each.
+        """Move the covariance on over M pieces that last seconds (M,), with the jacobians (M, 37, 37) of each.
 
-        variances (M, 26) are added, and what a white acceleration of a density in m/s^2/sqrt(Hz) adds.
+        variances (M, 37) are added, and what a white acceleration of a density in m/s^2/sqrt(Hz) adds.
         """
         noise = variances[:, :, None] * np.eye(DIMENSION)
         by_axis = (acceleration**2 * seconds)[:, None, None] * np.eye(3)
@@ -351,59 +398,108 @@ class Filter:
         noise[:, POSITION, POSITION] += by_axis * seconds**2 / 3
         for self.kf.F, self.kf.Q in zip(jacobians, noise, strict=True):
             self.kf.predict()
+            self.trail_cross = self.trail_cross @ self.kf.F.T
 
 
-def solve(
-    steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: EkfConfig, gyro_bias_std: float = 0.0
-) -> EkfResult:
-    """Filter N > 0 steps that follow each other, with an IMU in the camera's axes and time, or None.
+def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
+    """Filter the steps, which follow each other, with the IMU where there is one.
 
-    Steps that the IMU did not measure from start to end are predicted by constant velocity and rate. gyro_bias_std
-    (rad/s): how well a bias is known that was removed from the gyro.
+    Steps that it did not measure from start to end are predicted by constant velocity and rate. Loops, pairs that skip
+    frames and positions are not used: they speak of poses that a filter has left behind.
     """
-    imu = ImuWindows(inertial) if inertial is not None else None
-    ekf = Filter(config, gyro_bias_std)
+    steps, calibration = measurements.steps, measurements.calibration
+    samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
+    windows = [samples.over(step.source_stamp_ns, step.target_stamp_ns) if samples else None for step in steps]
+    if not any(window is not None for window in windows):
+        calibration = None
+    still = standing_still(steps, windows)
+    ekf = Filter(config, calibration, measurements.mounting, config.scale_sigma(steps))
     gate = chi2.isf(config.gate_probability, 6)
-    states, covariances, nis = [ekf.state], [ekf.pose_covariance()], []
-    measured = rejected = in_a_row = 0
-    for step, motion in zip(steps, motions_of(steps).as_matrix(), strict=True):
-        window = imu.over(step.source_stamp_ns, step.target_stamp_ns) if imu is not None else None
-        pair = Measurement(motion, step.covariance, step.duration_s)
-        measured += window is not None
+    rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [ekf.camera()]
+    in_a_row = 0
+    for step, motion, window, stands in zip(steps, motions_of(steps).as_matrix(), windows, still, strict=True):
+        pair = Measurement(motion, step.covariance + _by_stamps(step, config.stamp_jitter_s), step.duration_s)
         before = ekf.state, ekf.kf.P
         ekf.predict(window, pair.seconds)
-        nis.append(ekf.squared_innovation(pair))
-        if nis[-1] <= gate:
+        innovation, nis = ekf.squared_innovation(pair)
+        used = nis <= gate or in_a_row >= config.max_rejected_in_a_row
+        if nis <= gate:
             in_a_row = 0
-            ekf.update(pair)
-        elif in_a_row < config.max_rejected_in_a_row:
-            in_a_row += 1
-            rejected += 1
-        else:
+        elif used:  # so many cannot all be wrong: it is the prediction that is
             ekf.state, ekf.kf.P = before
             ekf.forget_velocity()
             ekf.predict(None, pair.seconds)
+        else:
+            in_a_row += 1
+        if used:
             ekf.update(pair)
-        ekf.clone(pair.seconds)
-        states.append(ekf.state)
-        covariances.append(ekf.pose_covariance())
+        if stands and used:
+            ekf.stand_still()
+        if window is None:
+            ekf.state = replace(ekf.state, rate=_rate(ekf.state, pair.seconds))
+        ekf.clone()
+        rows.append(_row(ekf, innovation, nis, used))
+        cameras.append(ekf.camera())
 
-    rotations = Rotation.from_matrix(np.stack([state.R for state in states]))
-    poses = RigidTransform.from_components(np.stack([state.p for state in states]), rotations)
-    return EkfResult(
-        Trajectory(stamps_of(steps), poses, np.stack(covariances)),
+    stamps_ns = stamps_of(steps)
+    series = EstimatorSeries(stamps_ns, *(np.array(column) for column in zip(*rows, strict=True)))
+    poses, covariances = (np.stack(column) for column in zip(*cameras, strict=True))
+    rejected = int(np.sum(~series.used))
+    measured = sum(window is not None for window in windows)
+    return Estimate(
+        Trajectory(stamps_ns, RigidTransform.from_matrix(poses), covariances),
+        _note(measured, len(steps), rejected),
         rejected,
-        np.array(nis),
-        _note(measured, len(steps)),
-        ekf.state.gyro_bias,
-        ekf.state.accelerometer_bias,
-        ekf.state.gravity,
+        series if calibration is not None else _without_biases(series),
     )
 
 
-def _note(measured: int, steps: int) -> str:
+def _by_stamps(pair: PairEstimate, jitter_s: float) -> FloatArray:
+    """What uncertain stamps add to the covariance (6, 6) of a pair: its motion took a little longer, or less long."""
+    rates = pair.T_source_target.as_exp_coords() / pair.duration_s
+    by_rotation, by_translation = (np.outer(rates[part], rates[part]) for part in (slice(0, 3), slice(3, 6)))
+    return np.asarray(2.0 * jitter_s**2 * block_diag(by_rotation, by_translation))
+
+
+def _rate(state: State, seconds: float) -> FloatArray:
+    """The rate (3,) rad/s of the turning since the clone, by which a step without an IMU is predicted to go on."""
+    return log(state.clone[:3, :3].T @ state.R) / seconds
+
+
+def _row(ekf: Filter, innovation: FloatArray, nis: float, used: bool) -> tuple[FloatArray | float | bool, ...]:
+    """What `EstimatorSeries` holds for a frame, in its order."""
+    state, front_end_std = ekf.state, ekf.std(FRONT_END)
+    return (
+        state.gyro_bias,
+        ekf.std(GYRO_BIAS),
+        state.accelerometer_bias,
+        ekf.std(ACCELEROMETER_BIAS),
+        state.front_end[0],
+        front_end_std[0],
+        state.front_end[1:],
+        front_end_std[1:],
+        innovation,
+        nis,
+        used,
+    )
+
+
+def _without_biases(series: EstimatorSeries) -> EstimatorSeries:
+    """The series of a filter that had no IMU."""
+    nothing = np.full((len(series), 3), np.nan)
+    return replace(
+        series,
+        gyro_bias=nothing,
+        gyro_bias_std=nothing,
+        accelerometer_bias=nothing,
+        accelerometer_bias_std=nothing,
+    )
+
+
+def _note(measured: int, steps: int, rejected: int) -> str:
+    left_out = f"; pairs rejected: {rejected}" if rejected else ""
     if measured == 0:
-        return "predicted by constant velocity: no IMU"
+        return f"predicted by constant velocity: no IMU{left_out}"
     if measured < steps:
-        return f"predicted by the IMU on {measured} of {steps} steps, by constant velocity on the others"
-    return "predicted by the IMU"
+        return f"predicted by the IMU on {measured} of {steps} steps, by constant velocity on the others{left_out}"
+    return f"predicted by the IMU{left_out}"

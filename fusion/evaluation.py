@@ -62,6 +62,20 @@ class ErrorSeries(NamedTuple):
     rotation_sigma_rad: FloatArray | None
 
 
+class SegmentErrors(NamedTuple):
+    """The errors of M segments: the pose that the estimate ends in, where both begin in the same one.
+
+    start, end (M,): indices of poses. length_m (M,): the nominal length. translation_percent (M,): distance between
+    the ends by length. rotation_deg_per_100m (M,): angle between them by length.
+    """
+
+    start: IntArray
+    end: IntArray
+    length_m: FloatArray
+    translation_percent: FloatArray
+    rotation_deg_per_100m: FloatArray
+
+
 def evaluate(
     estimate: Trajectory,
     ground_truth: Trajectory | None,
@@ -119,7 +133,19 @@ def kitti_errors(
     truth: RigidTransform,
     segment_lengths_m: Sequence[float] = KITTI_SEGMENT_LENGTHS_M,
 ) -> tuple[float | None, float | None, int]:
-    """t_rel (percent), r_rel (degrees per 100 m) and the number of segments they are the plain mean over.
+    """t_rel (percent), r_rel (degrees per 100 m) and the number of segments they are the plain mean over."""
+    errors = segment_errors(estimate, truth, segment_lengths_m)
+    if not len(errors.start):
+        return None, None, 0
+    return float(np.mean(errors.translation_percent)), float(np.mean(errors.rotation_deg_per_100m)), len(errors.start)
+
+
+def segment_errors(
+    estimate: RigidTransform,
+    truth: RigidTransform,
+    segment_lengths_m: Sequence[float] = KITTI_SEGMENT_LENGTHS_M,
+) -> SegmentErrors:
+    """The error of every segment of N poses, by their starts and then by their lengths.
 
     As in the KITTI odometry devkit: a segment starts at every tenth frame and ends at the first frame whose distance
     travelled in the ground truth exceeds its length; segments that the trajectory is too short for do not exist.
@@ -132,12 +158,12 @@ def kitti_errors(
     exists = end < len(distance_m)
     start, end, length_m = start[exists], end[exists], length_m[exists]
     if not len(start):
-        return None, None, 0
+        return SegmentErrors(start, end, length_m, np.zeros(0), np.zeros(0))
     true_motion = truth[start].inv() * truth[end]
     error = (estimate[start].inv() * estimate[end]).inv() * true_motion
-    t_rel = np.mean(np.linalg.norm(error.translation, axis=1) / length_m)
-    r_rel = np.mean(error.rotation.magnitude() / length_m)
-    return float(100.0 * t_rel), float(100.0 * np.rad2deg(r_rel)), len(start)
+    translation_percent = 100.0 * np.linalg.norm(error.translation, axis=1) / length_m
+    rotation_deg_per_100m = 100.0 * np.rad2deg(error.rotation.magnitude()) / length_m
+    return SegmentErrors(start, end, length_m, translation_percent, rotation_deg_per_100m)
 
 
 def absolute_trajectory_error(estimate_m: FloatArray, truth_m: FloatArray) -> float:

@@ -105,6 +105,13 @@ class ImuCalibration:
     gyro_bias_std: float = 0.0
     faulty_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
+    @property
+    def mounting(self) -> Rotation:
+        """rotation_imu_camera of an IMU that is used; raises ValueError where it is unknown."""
+        if self.rotation_imu_camera is None:
+            raise ValueError("the mounting of the IMU is unknown")
+        return self.rotation_imu_camera
+
 
 def calibrate(
     pairs: Sequence[PairEstimate], imu: ImuSeries, rotation: Rotation | None, time_offset_s: float | None
@@ -157,18 +164,21 @@ def calibrate(
     )
 
 
+def on_camera_clock(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
+    """The IMU on the camera's clock, in its own axes, without its faulty stretches."""
+    good = _outside(imu, calibration.faulty_ns)
+    return replace(good, stamps_ns=good.stamps_ns - round(calibration.time_offset_s * NANOSECONDS))
+
+
 def in_camera_axes(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
     """The IMU on the camera's clock and in the camera's axes, without its gyro bias and faulty stretches.
 
     Raises ValueError where the mounting is unknown.
     """
-    if calibration.rotation_imu_camera is None:
-        raise ValueError("the mounting of the IMU is unknown")
-    to_camera = calibration.rotation_imu_camera.inv()
-    good = _outside(imu, calibration.faulty_ns)
+    to_camera = calibration.mounting.inv()
+    good = on_camera_clock(imu, calibration)
     return replace(
         good,
-        stamps_ns=good.stamps_ns - round(calibration.time_offset_s * NANOSECONDS),
         angular_velocity=to_camera.apply(good.angular_velocity - calibration.gyro_bias),
         linear_acceleration=to_camera.apply(good.linear_acceleration),
     )

@@ -9,7 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.imu import ImuCalibration
-from fusion_io.records import EstimatorSeries, GnssFix, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import EstimatorSeries, FloatArray, GnssFix, ImuSeries, PairEstimate, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """How an IMU is mounted and what its clock reads, as a back end has refined it.
+
+    T_camera_imu (4, 4); ahead_s: how much further ahead of the camera's its clock is than the calibration says;
+    misalignment (3,) rad: of the front end's rotations against its translations. covariance (10, 10): of the right
+    perturbation of T_camera_imu, rotation first, of ahead_s, and of misalignment.
+    """
+
+    T_camera_imu: FloatArray
+    ahead_s: float
+    misalignment: FloatArray
+    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,14 +32,16 @@ class Measurements:
     """All that is known about one motion of the camera.
 
     steps: pair estimates that follow each other without holes (`chain.bridge_gaps`). imu: samples in the IMU's own axes
-    and time, and calibration: how they relate to the camera; both None where there is no IMU to be used. skips: pair
-    estimates between frames of the same steps that are further apart. loops: the same between frames where the camera
-    came back. gnss: positions of the antenna.
+    on the camera's clock, without what is faulty, and calibration: what is known of how they relate to the camera; both
+    None where there is no IMU to be used. mounting: the same where a back end has refined it. skips: pair estimates
+    between frames of the same steps that are further apart. loops: the same between frames where the camera came back.
+    gnss: positions of the antenna.
     """
 
     steps: Sequence[PairEstimate]
     imu: ImuSeries | None = None
     calibration: ImuCalibration | None = None
+    mounting: Mounting | None = None
     skips: Sequence[PairEstimate] = ()
     loops: Sequence[PairEstimate] = ()
     gnss: Sequence[GnssFix] = ()
@@ -36,7 +53,7 @@ class Estimate:
 
     trajectory: with the covariance of every pose. note: one line on how the measurements were used. rejected: how many
     of them were left out as outliers. series: what was estimated beside the poses. loops_used (M,): which of the loops
-    were believed; empty for a back end that takes none.
+    were believed; empty for a back end that takes none. mounting: as it was refined.
     """
 
     trajectory: Trajectory
@@ -44,3 +61,4 @@ class Estimate:
     rejected: int = 0
     series: EstimatorSeries | None = None
     loops_used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    mounting: Mounting | None = None

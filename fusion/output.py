@@ -5,9 +5,10 @@ Every file appears whole or not at all: it is written under a temporary name and
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -16,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from fusion import plots
+from fusion import plots, report
 from fusion.config import RunConfig, to_toml
 from fusion.evaluation import Metrics
 from fusion.imu import ImuCalibration
+from fusion.measurements import Estimate
 from fusion_io.errors import LogError, UsageError
 from fusion_io.findings import Findings
 from fusion_io.messages import CAMERA_FRAME
@@ -43,7 +45,7 @@ PACKAGES = ("violearner-fusion", "numpy", "scipy", "torch", "gtsam", "filterpy",
 class Outcome:
     """All that a run read and computed; trajectories and metrics by name: raw, posegraph, ekf.
 
-    remarks: what the back ends say about their work, in a line each.
+    estimates: all that the back ends found, by the same names.
     """
 
     log: Log
@@ -53,9 +55,10 @@ class Outcome:
     ground_truth: Trajectory | None
     calibration: ImuCalibration
     trajectories: Mapping[str, Trajectory]
-    remarks: Mapping[str, str]
+    estimates: Mapping[str, Estimate]
     metrics: Mapping[str, Metrics]
     findings: Findings
+    loops: Sequence[PairEstimate] = ()
 
     @property
     def duration_s(self) -> float:
@@ -89,10 +92,16 @@ def write_log(folder: Path, outcome: Outcome) -> None:
             writer.mounting(mounting)
         writer.imu(outcome.imu)
         writer.pairs(outcome.pairs)
+        writer.loops(outcome.loops)
         if outcome.ground_truth is not None:
             writer.ground_truth(outcome.ground_truth)
         for name, trajectory in outcome.trajectories.items():
             writer.trajectory(name, trajectory)
+        for name, estimate in outcome.estimates.items():
+            if estimate.series is not None:
+                writer.estimator(name, estimate.series)
+            writer.overview(name, trajectory)
+        writer.frame_tree([*outcome.trajectories][-1])
         _write_frames(writer, outcome)
 
 
@@ -116,6 +125,12 @@ def write_plots(folder: Path, outcome: Outcome) -> None:
     for name, plot in (("trajectories.png", plots.plot_trajectories), ("errors.png", plots.plot_errors)):
         with _replacing(folder / name) as temporary:
             plot(title, outcome.trajectories, outcome.ground_truth).savefig(temporary, format="png")
+
+
+def write_report(folder: Path, outcome: Outcome) -> None:
+    """Write report.html, the page that shows all of it."""
+    with _replacing(folder / "report.html") as temporary:
+        report.write_report(temporary, report.content_of(outcome))
 
 
 def write_metrics(folder: Path, outcome: Outcome, seconds: Mapping[str, float]) -> None:
@@ -156,13 +171,15 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
 def _write_frames(writer: LogWriter, outcome: Outcome) -> None:
     """Stream the frames in the frame id that the mounting in our logs refers to: whole, or stamp and camera alone."""
     log, last_ns = outcome.log, -1
+    end_ns = outcome.trajectories["raw"].stamps_ns[-1]  # before the end of the log where the run was interrupted
     if outcome.config.record == "all" and log.has_frames:
-        for frame in _as_far_as_readable(log.frames(), outcome.findings):
+        frames = itertools.takewhile(lambda frame: frame.stamp_ns <= end_ns, log.frames())
+        for frame in _as_far_as_readable(frames, outcome.findings):
             writer.frame(replace(frame, camera=replace(frame.camera, frame_id=CAMERA_FRAME)))
             last_ns = frame.stamp_ns
     camera = replace(log.camera_info() or NOT_CALIBRATED, frame_id=CAMERA_FRAME)
     stamps = log.frame_stamps()
-    for stamp_ns in stamps[stamps > last_ns].tolist():
+    for stamp_ns in stamps[(stamps > last_ns) & (stamps <= end_ns)].tolist():
         writer.camera_info(stamp_ns, camera)
 
 

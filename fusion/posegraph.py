@@ -1,288 +1,487 @@
-"""The pose graph back end: pair estimates and preintegrated inertial measurements in one least-squares problem (GTSAM).
+"""The pose graph back end: everything that was measured about a motion in one least-squares problem (GTSAM).
 
-Variables are the camera poses in the first camera's frame and, where an IMU measured, velocities, IMU biases and the
-direction of gravity in that frame. The first pose is fixed, so that the marginal covariances are those of the poses
-relative to it. Without an IMU the graph is a chain: its solution is the raw trajectory, its marginals the propagated
-covariances.
+Variables: the poses X of the IMU in the first camera's frame, its velocities V and biases B, the direction of gravity
+G, how it is mounted and what its clock reads E, and the lasting errors S of the front end, one state a second. The
+first camera is the world: X(0) is tied to E, so that the covariances of the camera's poses are those relative to it.
+Without an IMU the poses are those of the camera, and without loops or positions the solution is the raw trajectory.
 
 Preintegration: Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", 2017. All linear
-systems are solved by QR: Cholesky fails on graphs whose factors differ so much in weight.
+systems are solved by QR: Cholesky fails on graphs whose factors differ so much in weight. Outliers are found by
+graduated non-convexity with the Geman-McClure kernel: Yang et al., "Graduated Non-Convexity for Robust Spatial
+Perception", 2020.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, G, V, X
+from gtsam.symbol_shorthand import B, E, G, S, V, X
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.chain import ImuWindow, ImuWindows, chain, motions_of, stamps_of
-from fusion.config import PoseGraphConfig
+from fusion import marginals, outliers
+from fusion.chain import ImuWindow, ImuWindows, chain
+from fusion.config import PoseGraphConfig, Robust
+from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
+from fusion.imu import ImuCalibration
+from fusion.measurements import Estimate, Measurements, Mounting
+from fusion.pair_model import camera
 from fusion_io.errors import LogError
-from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate, Trajectory
+from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first direction of gravity
 FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that the solver suffers
 INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
-BATCHES = 10  # whose means tell how far the errors of pairs are correlated in time
-MIN_WINDOWS = 2 * BATCHES
-REJECTED_INFLATION = 100.0  # on the standard deviations of a pair that is left out: no more than a hint
+MIN_WINDOWS = 20
+KNOT_S = 1.0  # between states of the front end
 MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance is singular but for rounding
 
-
-@dataclass(frozen=True, slots=True)
-class PoseGraphResult:
-    """The fused trajectory with the marginal covariance of every pose, and what became of the measurements.
-
-    note: one line on how the IMU was used, or why it was not. imu_factors: steps with a preintegrated factor. Where
-    the rotations of IMU and pair contradict each other beyond noise, one of them is left out: imu_rejected and
-    pairs_rejected count those.
-    """
-
-    trajectory: Trajectory
-    note: str
-    imu_factors: int = 0
-    imu_rejected: int = 0
-    pairs_rejected: int = 0
+MAX_ITERATIONS = 30
+FORGIVING_ITERATIONS = 2  # before anything is judged
+CONVERGED = 1e-5  # rad, m: a step that moves no pose further ends the iteration
+ANNEALING = 4.0  # of the kernel's width from step to step
+REJECTED_WEIGHT = 1e-4  # of a measurement that is left out: no more than a hint, where nothing else is known
 
 
 @dataclass(frozen=True, slots=True)
-class GyroComparison:
-    """What the rotations of gyro and pairs say of each other.
+class Problem:
+    """A graph, where its solution is looked for from, and those of its factors that are evaluated together.
 
-    bias (3,) rad/s: the mean difference of their rates. bias_sigma: how far from zero the gyro's bias may be, before
-    the pairs are asked. inflation: the factor on the standard deviation of pair rotations after which their sums over
-    time are as uncertain as they are. imu_wrong, pair_wrong (N,): steps where one of the two is beyond noise.
+    T_camera_imu (4, 4): what E(0) strays from. twists (K, 6): of the IMU at the stamps of the poses, or None where the
+    poses are those of the camera. knots (K,): the front end's state at each stamp.
     """
 
-    bias: FloatArray
-    bias_sigma: float
-    inflation: float
-    imu_wrong: NDArray[np.bool_]
-    pair_wrong: NDArray[np.bool_]
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    stamps_ns: IntArray
+    T_camera_imu: FloatArray
+    twists: FloatArray | None
+    knots: IntArray
+    batches: list[Batch] = field(default_factory=list)
+
+    @property
+    def tied_up(self) -> bool:
+        """Whether factors reach beyond poses that follow each other."""
+        return any(isinstance(batch, PairFactors) and np.any(batch.target - batch.source > 1) for batch in self.batches)
+
+    def add(self, batch: Batch) -> Batch:
+        """Add factors to the graph."""
+        self.batches.append(batch)
+        batch.add_to(self.graph)
+        return batch
 
 
-def solve(steps: Sequence[PairEstimate], inertial: ImuSeries | None, config: PoseGraphConfig) -> PoseGraphResult:
-    """The most likely trajectory of N steps given an IMU in the camera's axes and time, or None.
+class Solution(NamedTuple):
+    """The values that minimise a problem, and the joint covariances of each variable with E(0) where there is one."""
 
-    Where the IMU has holes there is no factor, and its bias walks on. Where it cannot be used the pairs alone are
-    solved, and the note says why. Raises LogError for a step that is no measurement: a rotation or covariance that
-    is not one.
+    values: gtsam.Values
+    covariances: dict[int, FloatArray]
+
+
+def solve(measurements: Measurements, config: PoseGraphConfig) -> Estimate:
+    """The most likely trajectory of the camera, the covariance of every pose, and what was estimated beside them.
+
+    Where the IMU has holes there is no factor; where it cannot be used it is left out, and the note says why. Raises
+    LogError for a pair estimate that is no measurement: a rotation or covariance that is not one.
     """
-    check(steps)
-    if inertial is None:
-        return PoseGraphResult(solve_pairs(steps), "pairs only")
-    samples = ImuWindows(inertial)
+    check([*measurements.steps, *measurements.skips, *measurements.loops])
+    windows, problem_with_imu = _windows(measurements)
+    try:
+        return _solve(measurements, windows, problem_with_imu, config)
+    except RuntimeError as error:  # IndeterminantLinearSystemException of GTSAM, for one
+        if not any(windows):
+            raise
+        reason = f"the graph with the IMU has no solution ({' '.join(str(error).split())})"
+        return _solve(measurements, [None] * len(windows), reason, config)
+
+
+def _windows(measurements: Measurements) -> tuple[list[ImuWindow | None], str]:
+    """What the IMU measured during each step, and a reason if that is too little."""
+    steps, imu = measurements.steps, measurements.imu
+    if imu is None:
+        return [None] * len(steps), "no IMU"
+    samples = ImuWindows(imu)
     windows = [samples.over(step.source_stamp_ns, step.target_stamp_ns) for step in steps]
     measured = sum(window is not None for window in windows)
     if measured < MIN_WINDOWS:
-        return PoseGraphResult(solve_pairs(steps), f"pairs only: the IMU measured {measured} of {len(steps)} steps")
-    gyro = compare_rotations(steps, windows, config)
-    used = [None if wrong else window for window, wrong in zip(windows, gyro.imu_wrong, strict=True)]
-    weighed = _weigh(steps, gyro)
-    try:
-        trajectory = solve_inertial(weighed, used, gyro, config)
-    except RuntimeError as error:  # IndeterminantLinearSystemException of GTSAM, for one
-        reason = " ".join(str(error).split())
-        return PoseGraphResult(solve_pairs(steps), f"pairs only: the graph with the IMU has no solution ({reason})")
-    imu_rejected, pairs_rejected = int(gyro.imu_wrong.sum()), int(gyro.pair_wrong.sum())
-    factors = measured - imu_rejected
-    note = f"IMU on {factors} of {len(steps)} steps; rejected: IMU on {imu_rejected}, pair on {pairs_rejected}"
-    return PoseGraphResult(trajectory, note, factors, imu_rejected, pairs_rejected)
+        return [None] * len(steps), f"the IMU measured {measured} of {len(steps)} steps"
+    return windows, ""
 
 
-def check(steps: Sequence[PairEstimate]) -> None:
+def _solve(
+    measurements: Measurements, windows: Sequence[ImuWindow | None], without_imu: str, config: PoseGraphConfig
+) -> Estimate:
+    steps, calibration = measurements.steps, measurements.calibration
+    inertial = calibration if any(window is not None for window in windows) else None
+    mounting = Rotation.identity() if inertial is None else inertial.mounting
+    bias = np.zeros(3) if inertial is None else inertial.gyro_bias
+    wrong = outliers.suspects(steps, windows, mounting, bias, config.gate_probability)
+    windows = [None if bad else window for window, bad in zip(windows, wrong.imu, strict=True)]
+
+    start = _repaired(steps, windows, wrong.pair, mounting, bias)
+    problem = _pairs_only(steps, start) if inertial is None else _with_imu(steps, start, windows, inertial, config)
+    pairs = _add_pairs(problem, steps, problem.knots[:-1])
+    pairs.weights[wrong.pair] = REJECTED_WEIGHT
+    skips = _add_pairs(problem, measurements.skips, NO_KNOT)
+    loops = _add_pairs(problem, measurements.loops, NO_KNOT)
+    _add_front_end(problem, config.scale_sigma(steps), config)
+    solution = minimise(problem, config)
+
+    rejected = np.flatnonzero(pairs.weights < 0.5)
+    loops_used = loops.weights >= 0.5
+    return Estimate(
+        trajectory_of(problem, solution),
+        _note(windows, without_imu, len(rejected), loops_used),
+        len(rejected) + int(wrong.imu.sum()) + int(np.sum(~loops_used)) + int(np.sum(skips.weights < 0.5)),
+        series_of(problem, solution, pairs),
+        loops_used,
+        _mounting(problem, solution),
+    )
+
+
+def check(pairs: Sequence[PairEstimate]) -> None:
     """Refuse, with a LogError, what would end the interpreter or never converge inside GTSAM."""
-    quats = np.stack([step.quat_wxyz for step in steps])
-    translations = np.stack([step.translation for step in steps])
-    covariances = np.stack([step.covariance for step in steps])
-    _refuse(steps, ~np.isfinite(np.hstack([quats, translations])).all(axis=1), "its pose is not finite")
-    _refuse(steps, abs(np.linalg.norm(quats, axis=1) - 1.0) > 1e-3, "its rotation is not a unit quaternion")
+    quats = np.stack([pair.quat_wxyz for pair in pairs])
+    translations = np.stack([pair.translation for pair in pairs])
+    covariances = np.stack([pair.covariance for pair in pairs])
+    _refuse(pairs, ~np.isfinite(np.hstack([quats, translations])).all(axis=1), "its pose is not finite")
+    _refuse(pairs, abs(np.linalg.norm(quats, axis=1) - 1.0) > 1e-3, "its rotation is not a unit quaternion")
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     finite = np.isfinite(covariances).all(axis=(1, 2)) & (variances > 0.0).all(axis=1)
-    _refuse(steps, ~finite, "its covariance has variances that are not finite and positive")
+    _refuse(pairs, ~finite, "its covariance has variances that are not finite and positive")
     sigmas = np.sqrt(variances)
     correlations = covariances / (sigmas[:, :, None] * sigmas[:, None, :])
     symmetric = np.isclose(correlations, correlations.swapaxes(1, 2)).all(axis=(1, 2))
     definite = np.linalg.eigvalsh(correlations)[:, 0] > MIN_EIGENVALUE
-    _refuse(steps, ~(symmetric & definite), "its covariance is not symmetric and positive definite")
+    _refuse(pairs, ~(symmetric & definite), "its covariance is not symmetric and positive definite")
 
 
-def _refuse(steps: Sequence[PairEstimate], bad: NDArray[np.bool_] | np.bool_, reason: str) -> None:
+def _refuse(pairs: Sequence[PairEstimate], bad: NDArray[np.bool_] | np.bool_, reason: str) -> None:
     if bad.any():
-        raise LogError(f"pair estimate at {steps[int(bad.argmax())].target_stamp_ns} ns: {reason}")
+        raise LogError(f"pair estimate at {pairs[int(bad.argmax())].target_stamp_ns} ns: {reason}")
 
 
-def solve_pairs(steps: Sequence[PairEstimate]) -> Trajectory:
-    """The graph of the pairs alone: the raw chain, with marginal covariances."""
-    return _optimise(_pair_graph(steps), _pose_values(chain(steps)), stamps_of(steps))
+# ------------------------------------------------------------------------------------------------------- the graph
 
 
-def compare_rotations(
-    steps: Sequence[PairEstimate], windows: Sequence[ImuWindow | None], config: PoseGraphConfig
-) -> GyroComparison:
-    """Outliers, gyro bias, and correlation in time from the differences between the rates of gyro and pairs.
-
-    Errors of odometry are correlated in time, so that their mean is less certain than independent pairs would make
-    it. The scatter of the means of batches shows by how much (Law and Carson, 1979); an error that is constant over
-    the log shows nowhere, and is assumed: config.pair_rotation_rate_sigma.
-
-    A gyro that a navigation system has corrected has hardly a bias, and knowing that is worth more than the pairs; a
-    bare one has a large bias, which only the pairs can tell. It is taken for the first where the pairs show, ten times
-    sharper than the biases of bare gyros, a difference that can be chance.
-    """
-    measured = np.array([window is not None for window in windows])
-    seconds = np.array([step.duration_s for step in steps])[measured, None]
-    by_pair = motions_of(steps).rotation.as_rotvec()[measured] / seconds
-    turned = np.array([window.durations @ window.angular_velocity for window in windows if window is not None])
-    by_gyro = turned / seconds
-    claimed = np.array([np.trace(step.covariance[:3, :3]) / 3 for step in steps])[measured] / seconds[:, 0] ** 2
-
-    agree = _without_outliers(by_gyro - by_pair, claimed, config.gate_probability)
-    bias, variance = _mean(by_gyro[agree] - by_pair[agree], claimed[agree])
-    variance += config.pair_rotation_rate_sigma**2
-    inflation = max(1.0, float(np.sqrt(variance * np.sum(1.0 / claimed[agree]))))
-
-    sharp = variance < (config.gyro_bias_sigma / 10) ** 2
-    corrected = sharp and bias @ bias < (variance + config.corrected_gyro_bias_sigma**2) * chi2.isf(0.05, 3)
-    bias_sigma = config.corrected_gyro_bias_sigma if corrected else config.gyro_bias_sigma
-
-    # Motion is smooth: of two that contradict each other, the one that leaves its neighbours' rate further is wrong.
-    time = np.array([step.source_stamp_ns for step in steps])[measured]
-    smooth = np.stack([np.interp(time, time[agree], axis) for axis in by_gyro[agree].T], axis=1)
-    pair_leaves_further = _norm(by_pair + bias - smooth) > _norm(by_gyro - smooth)
-    imu_wrong, pair_wrong = np.zeros((2, len(steps)), dtype=np.bool_)
-    imu_wrong[measured] = ~agree & ~pair_leaves_further
-    pair_wrong[measured] = ~agree & pair_leaves_further
-    return GyroComparison(bias, bias_sigma, inflation, imu_wrong, pair_wrong)
-
-
-def _without_outliers(differences: FloatArray, variances: FloatArray, probability: float) -> NDArray[np.bool_]:
-    """Which (N, 3) lie within a chi-square gate about their median, widened where variances (N,) prove too small."""
-    square = np.sum((differences - np.median(differences, axis=0)) ** 2, axis=1) / variances
-    scale = max(1.0, float(np.median(square) / chi2.median(3)))
-    return np.asarray(square <= scale * chi2.isf(probability, 3))
-
-
-def _mean(values: FloatArray, variances: FloatArray) -> tuple[FloatArray, float]:
-    """The weighted mean (3,) of a series (N, 3), and the variance of its components by the method of batch means."""
-    weights = 1.0 / variances
-    batches = zip(np.array_split(values, BATCHES), np.array_split(weights, BATCHES), strict=True)
-    means = [np.average(batch, axis=0, weights=weight) for batch, weight in batches]
-    return np.average(values, axis=0, weights=weights), float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES
-
-
-def _norm(vectors: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(vectors, axis=1))
-
-
-def _weigh(steps: Sequence[PairEstimate], gyro: GyroComparison) -> list[PairEstimate]:
-    """The steps with the covariances that the gyro shows to be right."""
-    scale = np.repeat([gyro.inflation, 1.0], 3)
-    inflated = np.outer(scale, scale)
-    return [
-        replace(step, covariance=step.covariance * inflated * (REJECTED_INFLATION**2 if wrong else 1.0))
-        for step, wrong in zip(steps, gyro.pair_wrong, strict=True)
-    ]
-
-
-def solve_inertial(
-    steps: Sequence[PairEstimate], windows: Sequence[ImuWindow | None], gyro: GyroComparison, config: PoseGraphConfig
+def _repaired(
+    steps: Sequence[PairEstimate],
+    windows: Sequence[ImuWindow | None],
+    wrong: NDArray[np.bool_],
+    mounting: Rotation,
+    bias: FloatArray,
 ) -> Trajectory:
-    """The graph of pairs and IMU, whose windows (one a step, some None) start from the bias that the gyro shows."""
-    raw = chain(steps)
-    graph, values = _pair_graph(steps), _pose_values(raw)
-    bias = gtsam.imuBias.ConstantBias(np.zeros(3), gyro.bias)
-    parameters = _preintegration_parameters(config)
+    """The chain of the steps, those that are wrong bridged by the velocity of the others and by the gyro."""
+    if not np.any(wrong):
+        return chain(steps)
+    seconds = np.array([step.duration_s for step in steps])
+    middle = np.cumsum(seconds) - seconds / 2
+    rates = np.stack([step.T_source_target.as_exp_coords() for step in steps]) / seconds[:, None]
+    good = ~wrong
+    bridged = list(steps)
+    for k in np.flatnonzero(wrong).tolist():
+        twist = np.array([np.interp(middle[k], middle[good], axis) for axis in rates[good].T]) * seconds[k]
+        if (window := windows[k]) is not None:
+            twist[:3] = mounting.inv().apply(window.rotation(bias).as_rotvec())
+        motion = RigidTransform.from_exp_coords(twist)
+        quat_wxyz = motion.rotation.as_quat(scalar_first=True)
+        bridged[k] = replace(steps[k], quat_wxyz=quat_wxyz, translation=motion.translation)
+    return chain(bridged)
+
+
+def _pairs_only(steps: Sequence[PairEstimate], start: Trajectory) -> Problem:
+    """The poses of the camera, the first one fixed."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
+    for k, pose in enumerate(start.poses.as_matrix()):
+        values.insert(X(k), gtsam.Pose3(pose))
+    return Problem(graph, values, start.stamps_ns, np.eye(4), None, _knots(start.stamps_ns))
+
+
+def _with_imu(
+    steps: Sequence[PairEstimate],
+    start: Trajectory,
+    windows: Sequence[ImuWindow | None],
+    calibration: ImuCalibration,
+    config: PoseGraphConfig,
+) -> Problem:
+    """The poses of the IMU, tied to the first camera; its velocities, biases, gravity and mounting; its factors."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    T_camera_imu = np.eye(4)
+    T_camera_imu[:3, :3] = calibration.mounting.inv().as_matrix()
+    poses = start.poses.as_matrix() @ T_camera_imu
+    seconds = start.stamps_ns / NANOSECONDS
+    velocities = np.gradient(poses[:, :3, 3], seconds, axis=0)
+    bias = gtsam.imuBias.ConstantBias(np.zeros(3), calibration.gyro_bias)
+    for k, (pose, velocity) in enumerate(zip(poses, velocities, strict=True)):
+        values.insert(X(k), gtsam.Pose3(pose))
+        values.insert(V(k), velocity)
+    knots = _knots(start.stamps_ns)
+    for j in range(knots[-1] + 1):
+        values.insert(B(j), bias)
     used = [(k, window) for k, window in enumerate(windows) if window is not None]
-    for k, window in used:
-        preintegrated = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
-        for duration, rate, acceleration in zip(*window, strict=True):
-            preintegrated.integrateMeasurement(acceleration, rate, duration)
-        graph.add(
-            gtsam.CombinedImuFactorWithGravityDirection(
-                X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), G(0), preintegrated, GRAVITY
-            )
-        )
+    values.insert(G(0), gtsam.Unit3(_gravity(used[:GRAVITY_STEPS], poses, velocities)))
+    values.insert(E(0), np.zeros(10))
 
-    velocities = np.gradient(raw.poses.translation, raw.stamps_ns / NANOSECONDS, axis=0)
-    states = sorted({state for k, _ in used for state in (k, k + 1)})
-    for k in states:
-        values.insert(V(k), velocities[k])
-        values.insert(B(k), bias)
-    values.insert(G(0), gtsam.Unit3(_gravity(used[:GRAVITY_STEPS], raw, velocities)))
+    given = not np.any(calibration.rotation_std_rad)
+    rotation_sigma = config.given_mounting_sigma if given else config.mounting_sigma
+    offset_sigma = config.given_time_offset_sigma if not calibration.time_offset_std_s else config.time_offset_sigma
+    sigmas = np.repeat(
+        [rotation_sigma, config.lever_arm_sigma, offset_sigma, config.pair_misalignment_sigma], [3, 3, 1, 3]
+    )
+    graph.add(gtsam.PriorFactorVector(E(0), np.zeros(10), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
 
-    sigmas = np.repeat([config.accelerometer_bias_sigma, gyro.bias_sigma], 3)
-    prior = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    graph.add(gtsam.PriorFactorConstantBias(B(states[0]), gtsam.imuBias.ConstantBias(), prior))
+    gyro_bias_sigma = np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)
+    sigmas = np.repeat([config.accelerometer_bias_sigma, gyro_bias_sigma], 3)
+    graph.add(gtsam.PriorFactorConstantBias(B(0), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    _add_bias_walk(graph, start.stamps_ns, knots, config)
+    _add_preintegrated(graph, windows, knots, bias, np.diff(seconds), config)
+
+    twists = np.zeros((len(poses), 6))
+    rates = np.array(
+        [(k, *(window.durations @ window.angular_velocity / window.durations.sum())) for k, window in used]
+    )
+    middle = (seconds[:-1] + seconds[1:])[rates[:, 0].astype(int)] / 2
+    twists[:, :3] = np.stack([np.interp(seconds, middle, axis) for axis in rates[:, 1:].T], axis=1)
+    twists[:, 3:] = np.einsum("nji,nj->ni", poses[:, :3, :3], velocities)
+    problem = Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
+    problem.add(WorldFactor(T_camera_imu, twists[:1], FIRST_POSE_SIGMA))
+    return problem
+
+
+def _add_bias_walk(
+    graph: gtsam.NonlinearFactorGraph, stamps_ns: IntArray, knots: IntArray, config: PoseGraphConfig
+) -> None:
+    """The biases of the IMU, one state a knot, wander."""
     walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3)
-    for before, after in pairwise(states):
-        if windows[before] is None:
-            seconds = (raw.stamps_ns[after] - raw.stamps_ns[before]) / NANOSECONDS
-            noise = gtsam.noiseModel.Diagonal.Sigmas(walk * np.sqrt(seconds))
-            graph.add(gtsam.BetweenFactorConstantBias(B(before), B(after), gtsam.imuBias.ConstantBias(), noise))
-    return _optimise(graph, values, raw.stamps_ns)
+    seconds = np.diff(stamps_ns[_first(knots)]) / NANOSECONDS
+    for j, dt in enumerate(seconds):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(walk * np.sqrt(dt))
+        graph.add(gtsam.BetweenFactorConstantBias(B(j), B(j + 1), gtsam.imuBias.ConstantBias(), noise))
 
 
-def _preintegration_parameters(config: PoseGraphConfig) -> gtsam.PreintegrationCombinedParams:
-    parameters = gtsam.PreintegrationCombinedParams(np.zeros(3))  # gravity is a variable of the graph
+def _add_preintegrated(
+    graph: gtsam.NonlinearFactorGraph,
+    windows: Sequence[ImuWindow | None],
+    knots: IntArray,
+    bias: gtsam.imuBias.ConstantBias,
+    seconds: FloatArray,
+    config: PoseGraphConfig,
+) -> None:
+    """A factor for every step that the IMU measured; over the others the velocity walks."""
+    parameters = gtsam.PreintegrationParams(np.zeros(3))  # gravity is a variable of the graph
     parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
     parameters.setAccelerometerCovariance(config.accelerometer_noise**2 * np.eye(3))
-    parameters.setBiasOmegaCovariance(config.gyro_bias_walk**2 * np.eye(3))
-    parameters.setBiasAccCovariance(config.accelerometer_bias_walk**2 * np.eye(3))
     parameters.setIntegrationCovariance(INTEGRATION_SIGMA**2 * np.eye(3))
-    return parameters
+    for k, (window, dt) in enumerate(zip(windows, seconds, strict=True)):
+        if window is None:
+            walk = gtsam.noiseModel.Isotropic.Sigma(3, config.unknown_acceleration * np.sqrt(dt))
+            graph.add(gtsam.BetweenFactorVector(V(k), V(k + 1), np.zeros(3), walk))
+            continue
+        preintegrated = gtsam.PreintegratedImuMeasurements(parameters, bias)
+        for duration, rate, acceleration in zip(*window, strict=True):
+            preintegrated.integrateMeasurement(acceleration, rate, duration)
+        variables = (X(k), V(k), X(k + 1), V(k + 1), B(int(knots[k])), G(0))
+        graph.add(gtsam.ImuFactorWithGravityDirection(*variables, preintegrated, GRAVITY))
 
 
-def _gravity(windows: Sequence[tuple[int, ImuWindow]], raw: Trajectory, velocities: FloatArray) -> FloatArray:
-    """Where gravity points in the first camera's frame, from some windows (with their step) and the raw trajectory.
+def _gravity(windows: Sequence[tuple[int, ImuWindow]], poses: FloatArray, velocities: FloatArray) -> FloatArray:
+    """Where gravity points, from some windows (with their step), poses (K, 4, 4) and velocities (K, 3) of the IMU.
 
     An accelerometer shows acceleration less gravity, so that gravity is what the change of velocity is short of.
     """
-    rotations = raw.poses.rotation.as_matrix()
-    shown = sum(rotations[k] @ (window.durations @ window.linear_acceleration) for k, window in windows)
+    shown = sum(poses[k, :3, :3] @ (window.durations @ window.linear_acceleration) for k, window in windows)
     gained = sum(velocities[k + 1] - velocities[k] for k, _ in windows)
     return np.asarray(gained - shown)
 
 
-def _pair_graph(steps: Sequence[PairEstimate]) -> gtsam.NonlinearFactorGraph:
-    """The first pose fixed, and a factor for every step."""
-    graph = gtsam.NonlinearFactorGraph()
-    fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
-    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
-    for k, (step, motion) in enumerate(zip(steps, motions_of(steps).as_matrix(), strict=True)):
-        noise = gtsam.noiseModel.Gaussian.Covariance(step.covariance)
-        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(motion), noise))
-    return graph
+def _knots(stamps_ns: IntArray) -> IntArray:
+    """The state of the front end at each stamp: one for every KNOT_S, numbered without gaps."""
+    seconds = (stamps_ns - stamps_ns[0]) // int(KNOT_S * NANOSECONDS)
+    return np.asarray(np.unique(seconds, return_inverse=True)[1])
 
 
-def _pose_values(trajectory: Trajectory) -> gtsam.Values:
-    values = gtsam.Values()
-    for k, pose in enumerate(trajectory.poses.as_matrix()):
-        values.insert(X(k), gtsam.Pose3(pose))
-    return values
+def _first(knots: IntArray) -> IntArray:
+    """Where each knot begins."""
+    return np.flatnonzero(np.diff(knots, prepend=-1))
 
 
-def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps_ns: IntArray) -> Trajectory:
-    """Solve the graph from the given values; the marginals come from iSAM2, GTSAM's only ones by QR in Python."""
-    solver = gtsam.LevenbergMarquardtParams()
-    solver.setLinearSolverType("MULTIFRONTAL_QR")
-    solution = gtsam.LevenbergMarquardtOptimizer(graph, values, solver).optimize()
+def _add_pairs(problem: Problem, pairs: Sequence[PairEstimate], knots: IntArray | int) -> PairFactors:
+    """Add pair estimates between poses of the problem."""
+    ends = np.array([(pair.source_stamp_ns, pair.target_stamp_ns) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    source, target = np.searchsorted(problem.stamps_ns, ends).T
+    knots = np.broadcast_to(knots, len(pairs))
+    factors = PairFactors(pairs, source, target, knots, problem.T_camera_imu, problem.twists)
+    problem.add(factors)
+    return factors
 
-    elimination = gtsam.ISAM2Params()
-    elimination.setFactorization("QR")
-    tree = gtsam.ISAM2(elimination)
-    tree.update(graph, solution)
-    poses = np.stack([solution.atPose3(X(k)).matrix() for k in range(len(stamps_ns))])
-    if not np.all(np.isfinite(poses)):
+
+def _add_front_end(problem: Problem, scale_sigma: float, config: PoseGraphConfig) -> None:
+    """The lasting errors of the front end fade and wander: a Gauss-Markov process."""
+    sigma = np.repeat([scale_sigma, config.pair_rate_bias_sigma], [1, 3])
+    correlation_s = np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3])
+    unit = gtsam.noiseModel.Unit.Create(4)
+    first = _first(problem.knots)
+    seconds = np.diff(problem.stamps_ns[first]) / NANOSECONDS
+    for j in range(len(first)):
+        problem.values.insert(S(j), np.zeros(4))
+    problem.graph.add(gtsam.PriorFactorVector(S(0), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
+    for j, dt in enumerate(seconds):
+        keep = np.exp(-dt / correlation_s)
+        whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
+        linear = gtsam.JacobianFactor(S(j), -whitener * keep, S(j + 1), whitener, np.zeros(4), unit)
+        point = gtsam.Values()
+        point.insert(S(j), np.zeros(4))
+        point.insert(S(j + 1), np.zeros(4))
+        problem.graph.add(gtsam.LinearContainerFactor(linear, point))
+
+
+# ---------------------------------------------------------------------------------------------------- its solution
+
+
+def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
+    """Gauss-Newton with QR, step by step less forgiving to measurements that may be wrong."""
+    gates = [chi2.isf(config.gate_probability, batch.dimension) for batch in problem.batches]
+    order = elimination_order(problem)
+    values, width = problem.values, np.inf
+    for iteration in range(MAX_ITERATIONS):
+        for batch in problem.batches:
+            batch.update(values)
+        if iteration == FORGIVING_ITERATIONS:
+            width = max(
+                batch.squared.max(initial=0.0) / gate for batch, gate in zip(problem.batches, gates, strict=True)
+            )
+        if iteration >= FORGIVING_ITERATIONS:
+            width = _reweigh(problem.batches, gates, width, config.robust)
+        tree = problem.graph.linearize(values).eliminateMultifrontal(order, gtsam.EliminateQR)
+        step = tree.optimize()
+        values = values.retract(step)
+        if iteration >= FORGIVING_ITERATIONS and width <= 1.0 and step.norm() / np.sqrt(step.size()) < CONVERGED:
+            break
+    if not np.all(np.isfinite(poses_of(values))):
         raise RuntimeError("the solution is not finite")
-    covariances = np.stack([tree.marginalCovariance(X(k)) for k in range(len(stamps_ns))])
+    for batch in problem.batches:
+        batch.update(values)
+    net = problem.graph.linearize(values).eliminateSequential(order, gtsam.EliminateQR)
+    mounted = [E(0)] if values.exists(E(0)) else []
+
+    def wanted(key: int) -> list[int] | None:
+        """Poses together with what they are mounted by; biases, errors of the front end, the mounting."""
+        kind = chr(gtsam.Symbol(key).chr())
+        return [key, *mounted] if kind == "x" else [key] if kind in "bse" else None
+
+    return Solution(values, marginals.covariances(net, wanted))
+
+
+def elimination_order(problem: Problem) -> gtsam.Ordering:
+    """Along time, which is best for a chain; where loops tie it up, GTSAM's heuristic. What all share comes last."""
+    shared = [key for key in (G(0), E(0)) if problem.values.exists(key)]
+    if problem.tied_up:
+        return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(problem.graph, gtsam.KeyVector(shared))
+    order = gtsam.Ordering()
+    inertial = problem.twists is not None
+    for k in reversed(range(len(problem.knots))):
+        knot = int(problem.knots[k])
+        of_frame = [V(k), X(k)] if inertial else [X(k)]
+        of_knot = ([B(knot), S(knot)] if inertial else [S(knot)]) if k == 0 or problem.knots[k - 1] != knot else []
+        for key in (*of_frame, *of_knot):
+            order.push_back(key)
+    for key in shared:
+        order.push_back(key)
+    return order
+
+
+def _reweigh(batches: Sequence[Batch], gates: Sequence[float], width: float, robust: Robust) -> float:
+    """Weights by the kernel of a width (in gates, squared); returns the width of the next step.
+
+    With gnc, once the width is that of the gate, measurements are in or out.
+    """
+    for batch, gate in zip(batches, gates, strict=True):
+        beyond = batch.squared / gate
+        if robust == "huber":
+            batch.weights = 1.0 / np.sqrt(np.maximum(beyond, 1.0))
+        elif robust == "gnc" and width > 1.0:
+            batch.weights = np.maximum((width / (width + beyond)) ** 2, REJECTED_WEIGHT)
+        elif robust == "gnc":
+            batch.weights = np.where(beyond > 1.0, REJECTED_WEIGHT, 1.0)
+    return width / ANNEALING if robust == "gnc" and width > 1.0 else min(width, 1.0)
+
+
+def trajectory_of(problem: Problem, solution: Solution) -> Trajectory:
+    """The poses of the camera at its own stamps, with their marginal covariances."""
+    poses = poses_of(solution.values)
+    if problem.twists is None:
+        covariances = np.stack([solution.covariances[X(k)] for k in range(len(poses))])
+        cameras = poses
+    else:
+        strayed = solution.values.atVector(E(0))
+        mounted = extrinsics(problem.T_camera_imu, strayed)
+        cameras, by_pose, by_extrinsics = camera(poses, mounted, problem.twists, strayed[6])
+        joint = np.stack([solution.covariances[X(k)] for k in range(len(poses))])
+        J = np.concatenate([by_pose, padded(by_extrinsics @ by_vector(strayed))], axis=2)
+        covariances = J @ joint @ J.swapaxes(1, 2)
     covariances[0] = 0.0  # the world itself
-    return Trajectory(stamps_ns, RigidTransform.from_matrix(poses), covariances)
+    return Trajectory(problem.stamps_ns, RigidTransform.from_matrix(cameras), covariances)
+
+
+def series_of(problem: Problem, solution: Solution, pairs: PairFactors) -> EstimatorSeries:
+    """What was estimated beside the poses; what a pair shows beyond the solution stands in for an innovation."""
+    values = solution.values
+    frames = len(problem.stamps_ns)
+    front_end = gtsam.utilities.extractVectors(values, "s")[problem.knots]
+    std = _std_at(problem, solution, S)
+    biases = np.full((frames, 12), np.nan)
+    if problem.twists is not None:
+        biases[:, :6] = [values.atConstantBias(B(j)).vector() for j in problem.knots.tolist()]
+        biases[:, 6:] = _std_at(problem, solution, B)
+    pairs.update(values)
+    shown = np.full((frames, 7), np.nan)
+    shown[1:] = np.column_stack([pairs.residual, pairs.squared])
+    return EstimatorSeries(
+        problem.stamps_ns,
+        gyro_bias=biases[:, 3:6],
+        gyro_bias_std=biases[:, 9:],
+        accelerometer_bias=biases[:, :3],
+        accelerometer_bias_std=biases[:, 6:9],
+        scale_error=front_end[:, 0],
+        scale_error_std=std[:, 0],
+        rate_bias=front_end[:, 1:],
+        rate_bias_std=std[:, 1:],
+        innovation=shown[:, :6],
+        nis=shown[:, 6],
+        used=np.concatenate([[True], pairs.weights >= 0.5]),
+    )
+
+
+def _mounting(problem: Problem, solution: Solution) -> Mounting | None:
+    """E(0), with its covariance about the mounting that it leads to."""
+    if problem.twists is None:
+        return None
+    strayed = solution.values.atVector(E(0))
+    J = np.eye(10)
+    J[:7, :7] = by_vector(strayed)
+    T_camera_imu = extrinsics(problem.T_camera_imu, strayed)
+    return Mounting(T_camera_imu, float(strayed[6]), strayed[7:], J @ solution.covariances[E(0)] @ J.T)
+
+
+def _std_at(problem: Problem, solution: Solution, symbol: Callable[[int], int]) -> FloatArray:
+    """The standard deviations (K, M) at every stamp of the states of a knot."""
+    knots = range(problem.knots[-1] + 1)
+    return np.sqrt([np.diag(solution.covariances[symbol(j)]) for j in knots])[problem.knots]
+
+
+def _note(
+    windows: Sequence[ImuWindow | None], without_imu: str, pairs_rejected: int, loops_used: NDArray[np.bool_]
+) -> str:
+    measured = sum(window is not None for window in windows)
+    imu = f"pairs only: {without_imu}" if not measured else f"IMU on {measured} of {len(windows)} steps"
+    rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
+    loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
+    return imu + rejected + loops

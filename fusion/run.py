@@ -6,45 +6,75 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter, strftime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
-from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+from fusion.export import Exports, add_options, checked, export
+from fusion_io import progress
+from fusion_io.errors import (
+    EXIT_DAMAGED,
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    EXIT_USAGE,
+    FusionError,
+    LogError,
+    UsageError,
+)
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from fusion.config import FrontendConfig, ImuConfig, RunConfig
-    from fusion.ekf import EkfResult
     from fusion.output import Outcome
-    from fusion.posegraph import PoseGraphResult
     from fusion_io.findings import Findings
     from fusion_io.reader import Log
-    from fusion_io.records import ImuSeries, PairEstimate, Trajectory
+    from fusion_io.records import ImuSeries, IntArray, PairEstimate, Trajectory
 
 # Modules that bring numpy, torch or GTSAM are imported by the function that needs them, so that --help answers at once.
+
+STANDARD_OUTPUT = Path("-")
+INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True, slots=True)
+class Presentation:
+    """How results are shown beside the folder they go to: json is a file to copy metrics.json to, or "-" for stdout."""
+
+    quiet: bool = False
+    json: Path | None = None
+    exports: Exports = field(default_factory=Exports)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
+    progress.silence(arguments.quiet)
     try:
         from fusion import config
 
-        return run(arguments.log, arguments.out, config.load(arguments.config, _overrides(arguments)))
+        exports = checked(Exports(arguments.csv, arguments.parquet, arguments.rerun))
+        presentation = Presentation(arguments.quiet, arguments.json, exports)
+        return run(arguments.log, arguments.out, config.load(arguments.config, _overrides(arguments)), presentation)
     except FusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+    except KeyboardInterrupt:
+        print("interrupted: nothing to show for it", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
-def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
+def run(log_path: Path, out: Path | None, config: RunConfig, presentation: Presentation = Presentation()) -> int:
     """Compute all about one log, write it to a folder, print the table; returns the exit code.
+
+    Interrupted (Ctrl-C) while pairs are estimated, it goes on with those that it has.
 
     Raises UsageError for a folder that cannot be used, and LogError for a log without anything to compute from.
     """
     stopwatch = Stopwatch()
-    from fusion import chain, imu, output
+    from fusion import chain, fusing, imu, output
     from fusion.evaluation import evaluate
     from fusion_io.findings import Findings
     from fusion_io.reader import open_log
@@ -59,35 +89,35 @@ def run(log_path: Path, out: Path | None, config: RunConfig) -> int:
     stopwatch.lap("pairs")
 
     calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
-    inertial = imu.in_camera_axes(samples, calibration) if calibration.used else None
-    faulty = len(calibration.faulty_ns)
-    findings.put("imu_faulty_stretches", faulty, f"stretches where the gyro contradicts the pairs, left out: {faulty}")
     stopwatch.lap("calibration")
 
-    steps, gaps = chain.bridge_gaps(log.frame_stamps(), pairs, inertial)
-    findings.put("gaps_bridged", gaps, f"gaps between pair estimates that were bridged: {gaps}")
-    trajectories, remarks = {"raw": chain.chain(steps)}, {}
+    known = fusing.measurements(pairs, samples, calibration, frame_stamps(log, pairs, findings), findings)
+    raw = chain.chain(known.steps)
     stopwatch.lap("raw")
 
-    for name in back_ends(config):
-        if fused := fuse(name, steps, inertial, calibration.gyro_bias_std, config, findings):
-            trajectories[name], remarks[name] = fused
-        stopwatch.lap(name)
+    known = replace(known, loops=loop_closures(log, raw, config, findings))
+    stopwatch.lap("loops")
 
+    estimates = fusing.fuse(known, config, findings)
+    stopwatch.lap("fusion")
+
+    trajectories = {"raw": raw} | {name: estimate.trajectory for name, estimate in estimates.items()}
     metrics = {name: evaluate(each, ground_truth, config.segment_lengths_m) for name, each in trajectories.items()}
     stopwatch.lap("evaluation")
 
     outcome = output.Outcome(
-        log, config, samples, pairs, ground_truth, calibration, trajectories, remarks, metrics, findings
+        log, config, samples, pairs, ground_truth, calibration, trajectories, estimates, metrics, findings, known.loops
     )
     output.write_log(folder, outcome)
     output.write_text(folder, outcome)
     stopwatch.lap("writing")
     output.write_plots(folder, outcome)
     stopwatch.lap("plots")
+    output.write_report(folder, outcome)
+    stopwatch.lap("report")
     output.write_metrics(folder, outcome, stopwatch.seconds)
 
-    report(folder, outcome)
+    present(folder, outcome, presentation)
     return exit_code(outcome)
 
 
@@ -100,27 +130,53 @@ def pair_estimates(
     A network that is adapted to the log first is left in the folder. Raises LogError where there are none.
     """
     if config.mode == "recorded" or (config.mode == "auto" and log.has_pairs):
-        pairs = log.pairs()
-        if not pairs:
-            raise LogError(f"{log.path}: no recorded pair estimates that can be used")
-        return pairs
+        if recorded := log.pairs():
+            return recorded
+        raise LogError(f"{log.path}: no recorded pair estimates that can be used")
     if not log.has_frames:
         raise LogError(f"{log.path}: no images to estimate pairs from; it has {', '.join(log.roles)}")
     from fusion_io.messages import decode_pair, encode_pair
-    from fusion_io.progress import track
     from learned.estimator import estimate_pairs
 
     weights = adapted_weights(log, config, folder) if config.adapt else config.weights
+    pairs: list[PairEstimate] = []
     skipped: Counter[str] = Counter()
-    frames = track(log.frames(), "pair estimates", len(log.frame_stamps()))
-    estimates = estimate_pairs(log, imu, weights, frames, skipped, config.refine)
-    pairs = [decode_pair(encode_pair(pair)) for pair in estimates]
+    frames = progress.track(log.frames(), "pair estimates", len(log.frame_stamps()))
+    try:
+        for pair in estimate_pairs(log, imu, weights, frames, skipped, config.refine):
+            pairs.append(decode_pair(encode_pair(pair)))
+    except KeyboardInterrupt:
+        if not pairs:
+            raise
+        if progress.is_watched():
+            print(f"interrupted: going on with {len(pairs)} pairs; Ctrl-C again to give up", file=sys.stderr)
+        until_s = (pairs[-1].target_stamp_ns - log.start_ns) / 1e9
+        findings.put(INTERRUPTED, 1, f"interrupted: results are of the first {until_s:.1f} s only")
     for name, count in skipped.items():
         findings.put(name, count, f"{name.replace('_', ' ')}: {count}")
     if not pairs:
         reasons = "; ".join(findings.notes) or f"it has {len(log.frame_stamps())} frames"
         raise LogError(f"{log.path}: no pair of frames could be estimated ({reasons})")
     return pairs
+
+
+def loop_closures(log: Log, raw: Trajectory, config: RunConfig, findings: Findings) -> Sequence[PairEstimate]:
+    """The loops that the log has recorded, or those found in its images, as they read back from their message."""
+    if recorded := log.loops():
+        return [loop for loop in recorded if loop.target_stamp_ns <= raw.stamps_ns[-1]]
+    if not (config.loops.find and log.has_frames):
+        return []
+    from fusion.loops import find_loops
+    from fusion_io.messages import decode_pair, encode_pair
+
+    found = find_loops(log, raw, config.frontend.weights, config.loops, findings)
+    return [decode_pair(encode_pair(loop)) for loop in found]
+
+
+def frame_stamps(log: Log, pairs: Sequence[PairEstimate], findings: Findings) -> IntArray:
+    """The frames that the trajectories lead through: all, or up to the last pair if the run was interrupted."""
+    stamps = log.frame_stamps()
+    return stamps[stamps <= pairs[-1].target_stamp_ns] if INTERRUPTED in findings.counts else stamps
 
 
 def adapted_weights(log: Log, config: FrontendConfig, folder: Path) -> Path:
@@ -141,69 +197,59 @@ def known_mounting(log: Log, config: ImuConfig) -> Rotation | None:
     return log.mounting()
 
 
-def back_ends(config: RunConfig) -> Sequence[str]:
-    """The names of the back ends that are asked for."""
-    return ("posegraph", "ekf") if config.backend == "both" else (config.backend,)
+def present(folder: Path, outcome: Outcome, presentation: Presentation) -> None:
+    """Show the results on the terminal, and hand them to the files and tools that were asked for.
 
-
-def fuse(
-    name: str,
-    steps: Sequence[PairEstimate],
-    inertial: ImuSeries | None,
-    gyro_bias_std: float,
-    config: RunConfig,
-    findings: Findings,
-) -> tuple[Trajectory, str] | None:
-    """The trajectory of a back end and its remark on it; None, and counted, where it fails: the others are not lost.
-
-    gyro_bias_std: standard deviation (rad/s) of the gyro bias that was taken off `inertial`.
+    stdout belongs to metrics.json where that is to go there; the table goes to stderr then.
     """
-    import numpy as np
+    for note in (*outcome.log.notes, *outcome.findings.notes):
+        print(f"warning: {note}", file=sys.stderr)
+    if not presentation.quiet:
+        print_results(folder, outcome, sys.stderr if presentation.json == STANDARD_OUTPUT else sys.stdout)
+    if presentation.json is not None:
+        copy_metrics(folder, presentation.json)
+    if presentation.exports != Exports():
+        from fusion.output import LOG_NAME
+        from fusion_io.reader import open_log
 
+        export(open_log(folder / LOG_NAME), outcome.log, presentation.exports)
+
+
+def copy_metrics(folder: Path, destination: Path) -> None:
+    """Copy metrics.json to a file or to stdout."""
+    text = (folder / "metrics.json").read_text(encoding="utf-8")
+    if destination == STANDARD_OUTPUT:
+        sys.stdout.write(text)
+        return
     try:
-        result: PoseGraphResult | EkfResult
-        if name == "posegraph":
-            from fusion import posegraph
-
-            result = posegraph.solve(steps, inertial, config.posegraph)
-            rejected = result.imu_rejected + result.pairs_rejected
-        else:
-            from fusion import ekf
-
-            result = ekf.solve(steps, inertial, config.ekf, gyro_bias_std)
-            rejected = result.rejected
-        if not np.all(np.isfinite(result.trajectory.poses.as_matrix())):
-            raise FloatingPointError("a pose is not finite")
-    except (FusionError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:  # GTSAM raises RuntimeError
-        findings.put(f"{name}_failed", 1, f"back end failed ({name}): {' '.join(str(error).split())}")
-        return None
-    findings.put(f"{name}_rejected", rejected, f"measurements rejected as outliers ({name}): {rejected}")
-    return result.trajectory, result.note
+        destination.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LogError(f"{destination}: {error.strerror}") from None
 
 
-def report(folder: Path, outcome: Outcome) -> None:
-    """Print the table, what became of the IMU and where the results are to stdout, and the warnings to stderr."""
-    from dataclasses import asdict
-
+def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
+    """Print the table, what became of the IMU and where the results are."""
     from rich.console import Console
 
     from fusion.table import HEADINGS, print_table
 
     log, calibration = outcome.log, outcome.calibration
-    for note in (*log.notes, *outcome.findings.notes):
-        print(f"warning: {note}", file=sys.stderr)
     title = f"{log.path.name}: {len(outcome.trajectories['raw'])} frames, {outcome.duration_s:.1f} s"
     metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
-    print_table(Console(), title, outcome.trajectories, metrics)
-    print(f"IMU {'used' if calibration.used else 'left out'}: {calibration.reason}")
-    for name, remark in outcome.remarks.items():
-        print(f"{HEADINGS[name]}: {remark}")
-    print(f"Results: {folder}")
+    print_table(Console(file=stream), title, outcome.trajectories, metrics)
+    print(f"IMU {'used' if calibration.used else 'left out'}: {calibration.reason}", file=stream)
+    for name, estimate in outcome.estimates.items():
+        print(f"{HEADINGS[name]}: {estimate.note}", file=stream)
+    print(f"Results: {folder}", file=stream)
 
 
 def exit_code(outcome: Outcome) -> int:
-    """1 where a back end that was asked for has nothing to show, 3 for a damaged log, else 0."""
-    if any(name not in outcome.trajectories for name in back_ends(outcome.config)):
+    """130 after Ctrl-C, 1 where a back end that was asked for has nothing to show, 3 for a damaged log, else 0."""
+    from fusion import fusing
+
+    if INTERRUPTED in outcome.findings.counts:
+        return EXIT_INTERRUPTED
+    if any(name not in outcome.trajectories for name in fusing.back_ends(outcome.config)):
         return EXIT_FAILED
     return EXIT_DAMAGED if outcome.log.damaged else EXIT_OK
 
@@ -225,15 +271,28 @@ class Stopwatch:
         now = perf_counter()
         self.seconds[stage] = now - self._last
         self._last = now
-        if sys.stderr.isatty():
+        if progress.is_watched():
             print(f"{stage}: {self.seconds[stage]:.1f} s", file=sys.stderr)
+
+
+_EPILOG = """\
+examples:
+  python -m fusion.run --log drive.mcap
+  python -m fusion.run --log drive.mcap --out runs/drive --config drive.toml --backend ekf
+  python -m fusion.run --log drive.mcap --topic image=/cam0/image_raw --topic imu=/imu0
+  python -m fusion.run --log drive.mcap --csv runs/tables --rerun runs/drive.rrd
+  python -m fusion.run --log drive.mcap --json - | jq .trajectories.ekf.ate_m
+
+exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a damaged log,
+130 interrupted (Ctrl-C while pairs are estimated: the results are of the pairs until then)"""
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m fusion.run",
         description="Compute absolute camera trajectories, raw and fused, from an RGB-D and IMU log.",
-        epilog="Exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a damaged log.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--log", type=Path, required=True, metavar="FILE.mcap", help="the log to compute from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: runs/<log name>-<time>)")
@@ -272,6 +331,9 @@ def _parser() -> argparse.ArgumentParser:
         help="the topic of a role where the log leaves it open; roles: image, depth, camera_info, imu, gyro, "
         "accelerometer, ground_truth, pairs, loops, gnss, tf_static; may be repeated",
     )
+    add_options(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="copy metrics.json there; - is stdout")
+    parser.add_argument("--quiet", action="store_true", help="print warnings and errors only, no progress, no table")
     return parser
 
 

@@ -56,9 +56,26 @@ def rgbd_odometry(source: CameraFrame, target: CameraFrame) -> Motion | None:
     if source.depth is None or source.image.shape[:2] != target.image.shape[:2]:
         return None
     points, pixels = tracks(source.depth, source.camera, grey(source), grey(target))
+    found = resect(points, pixels, target.camera.K, REPROJECTION_PX)
+    return None if found is None else Motion(found.T_source_target, int(found.inliers.sum()))
+
+
+@dataclass(frozen=True, slots=True)
+class Resection:
+    """T_source_target (4, 4), and which of N points agree with it, (N,)."""
+
+    T_source_target: FloatArray
+    inliers: NDArray[np.bool_]
+
+
+def resect(points: FloatArray, pixels: FloatArray, K: FloatArray, reprojection_px: float) -> Resection | None:
+    """The camera from which points (N, 3) m of the source camera's frame are seen at pixels (N, 2).
+
+    K (3, 3): of the camera that sees them; reprojection_px: further off, a point is an outlier. RANSAC, then least
+    squares over the inliers. None where fewer than `MIN_INLIERS` agree.
+    """
     if len(points) < MIN_INLIERS:
         return None
-    K = target.camera.K
     # OpenCV's RANSAC starts from the same random state at every call.
     found, rotvec, translation, inliers = cv2.solvePnPRansac(
         points,
@@ -66,7 +83,7 @@ def rgbd_odometry(source: CameraFrame, target: CameraFrame) -> Motion | None:
         K,
         None,
         iterationsCount=RANSAC_ITERATIONS,
-        reprojectionError=REPROJECTION_PX,
+        reprojectionError=reprojection_px,
         confidence=RANSAC_CONFIDENCE,
         flags=cv2.SOLVEPNP_AP3P,
     )
@@ -77,11 +94,11 @@ def rgbd_odometry(source: CameraFrame, target: CameraFrame) -> Motion | None:
     for _ in range(REFINEMENTS):
         rotvec, translation = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], K, None, rotvec, translation)
         projected = cv2.projectPoints(points, rotvec, translation, K, None)[0].reshape(-1, 2)
-        chosen = np.linalg.norm(projected - pixels, axis=1) < REPROJECTION_PX
+        chosen = np.linalg.norm(projected - pixels, axis=1) < reprojection_px
         if chosen.sum() < MIN_INLIERS:
             return None
     T_target_source = RigidTransform.from_components(translation.ravel(), Rotation.from_rotvec(rotvec.ravel()))
-    return Motion(T_target_source.inv().as_matrix(), int(chosen.sum()))
+    return Resection(T_target_source.inv().as_matrix(), chosen)
 
 
 def grey(frame: CameraFrame) -> NDArray[np.uint8]:

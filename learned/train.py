@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__.split("\n\n")[0],
         epilog="Exit codes: 0 all well, 1 nothing could be computed, 2 usage, 130 interrupted (run again to go on).",
     )
-    parser.add_argument("--preset", choices=sorted(RECIPES), default="fast")
+    parser.add_argument("--preset", choices=sorted(RECIPES), default="fast", help="the recipe (default: fast)")
     parser.add_argument("--out", type=Path, required=True, help="folder for data, checkpoints, curve and weights")
     parser.add_argument(
         "--data", type=_source, nargs="+", action="extend", metavar="SOURCE[@WEIGHT]",
@@ -119,10 +119,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=positive_integer,
         help="simulated clips to fit the covariance on (default: the preset's)",
     )
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="what all random numbers begin with (default: 0)")
     parser.add_argument("--workers", type=positive_integer, help="processes that render (default: one a core)")
     parser.add_argument("--threads", type=positive_integer, help="threads of the training itself (default: torch's)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="default: auto")
     parser.add_argument(
         "--precision", choices=("auto", "float32", "bf16"), default="auto",
         help="of the convolutions; geometry is always float32 (default: bf16 on cuda, else float32)",

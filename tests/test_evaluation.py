@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.evaluation import Metrics, errors_over_time, evaluate, kitti_errors
+from fusion.evaluation import Metrics, errors_over_time, evaluate, kitti_errors, segment_errors
 from fusion_io.records import NANOSECONDS, FloatArray, Trajectory
 
 PERIOD_NS = NANOSECONDS // 10
@@ -67,6 +67,24 @@ def test_segment_errors_are_those_of_the_devkit_written_as_loops() -> None:
     expected = _devkit(estimate.as_matrix(), truth.as_matrix(), lengths)
     assert expected[2] > 100
     assert_allclose(kitti_errors(estimate, truth, lengths), expected, rtol=1e-6)
+
+
+def test_a_segment_ends_at_the_first_pose_beyond_its_length_and_has_the_error_made_in_it() -> None:
+    """All of the error is made in one step: segments with that step have it, the others have none."""
+    truth, lengths = _walk(20, 200), (10.0, 40.0)
+    step, jump = 105, RigidTransform.from_exp_coords([0.0, 0.02, 0.0, 0.0, 0.0, 0.5])
+    estimate = RigidTransform.concatenate([truth[:step], truth[step] * jump * truth[step].inv() * truth[step:]])
+    errors = segment_errors(estimate, truth, lengths)
+    assert set(errors.length_m.tolist()) == set(lengths)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth.translation, axis=0), axis=1))])
+    assert np.all(distance[errors.end] - distance[errors.start] > errors.length_m)
+    assert np.all(distance[errors.end - 1] - distance[errors.start] <= errors.length_m)
+    within = (errors.start < step) & (errors.end >= step)
+    assert 0 < within.sum() < len(within)
+    assert_allclose(errors.rotation_deg_per_100m[within], 100 * np.rad2deg(0.02) / errors.length_m[within], rtol=1e-6)
+    assert_allclose(errors.rotation_deg_per_100m[~within], 0.0, atol=1e-9)
+    assert np.all(errors.translation_percent[within] > 1e-3)
+    assert_allclose(errors.translation_percent[~within], 0.0, atol=1e-9)
 
 
 def test_ate_and_rpe_are_those_of_evo() -> None:

@@ -25,7 +25,6 @@ def refusal(path: Path) -> str:
 @pytest.mark.parametrize(
     ("name", "reasons"),
     [
-        ("lichtblick_camera_json.mcap", ["/image/compressed (foxglove.CompressedImage, json)", "/camera_calibration"]),
         ("nav2_turtlebot.mcap", ["/odom (nav_msgs/msg/Odometry, cdr)", "/amcl_pose"]),
         ("rosbag2_cdr_test.mcap", ["/test_topic (test_msgs/msg/BasicTypes, cdr)"]),
         ("rosbag2_services.mcap", ["/test_service1/_service_event (test_msgs/srv/BasicTypes_Event, cdr)"]),
@@ -37,6 +36,11 @@ def test_real_logs_with_nothing_for_us_are_refused_by_what_they_hold(
     reason = refusal(shared_data / "foreign_mcap" / name)
     assert "nothing to work with" in reason
     assert all(part in reason for part in reasons)
+
+
+def test_a_real_log_with_two_cameras_is_refused_until_one_is_chosen(shared_data: Path) -> None:
+    reason = refusal(shared_data / "foreign_mcap" / "lichtblick_camera_json.mcap")
+    assert "2 topics could be the camera info: /camera_calibration, /camera_calibration/custom; choose one" in reason
 
 
 def test_every_real_log_is_read_or_refused(shared_data: Path) -> None:
@@ -81,7 +85,7 @@ def test_a_real_log_cut_in_the_middle_of_its_only_chunk_is_read_to_the_cut(share
         ("flatbuffer", "foxglove.RawImage", "flatbuffer", bytes(40)),
     ],
 )
-def test_encodings_that_we_do_not_know_are_named(
+def test_encodings_and_messages_that_we_cannot_read_are_named(
     tmp_path: Path, message_encoding: str, schema_name: str, schema_encoding: str, data: bytes
 ) -> None:
     path = tmp_path / "a.mcap"

@@ -90,6 +90,19 @@ def test_frames_are_what_was_written(sample: Path) -> None:
         assert (read.camera.width, read.camera.height, read.camera.frame_id) == (WIDTH, HEIGHT, "camera")
 
 
+def test_frames_can_be_asked_for_by_their_stamps_in_any_order(sample: Path) -> None:
+    log = open_log(sample)
+    every = list(log.frames())
+    asked = [3, 0, 3]
+    for index, frame in zip(asked, log.frames(log.frame_stamps()[asked]), strict=True):
+        assert frame.stamp_ns == every[index].stamp_ns
+        np.testing.assert_array_equal(frame.image, every[index].image)
+        np.testing.assert_array_equal(frame.depth, every[index].depth)
+    assert not list(log.frames(np.zeros(0, np.int64)))
+    with pytest.raises(ValueError, match="no frame"):
+        next(log.frames(np.array([every[0].stamp_ns + 1])))
+
+
 def test_imu_and_pairs_are_the_same_to_the_bit(sample: Path) -> None:
     log, written = open_log(sample), imu_series()
     read = log.imu()

@@ -12,8 +12,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion_io.errors import LogError, UsageError
 from fusion_io.records import Trajectory
 from fusion_io.trajectory_files import (
+    file_format,
     nanoseconds,
     pair_estimates,
+    read_euroc,
     read_indexed_kitti_poses,
     read_kitti,
     read_kitti_poses,
@@ -250,3 +252,37 @@ def test_every_ground_truth_file_of_kitti_is_read(shared_data):
 def _plain(file: Path) -> np.ndarray:
     rows = np.loadtxt(file).reshape(-1, 3, 4)
     return np.concatenate([rows, np.tile([[[0, 0, 0, 1]]], (len(rows), 1, 1))], axis=1)
+
+
+# ----------------------------------------------------------------------------------------------------- EuRoC
+
+
+@pytest.mark.parametrize("further", [0, 3, 9], ids=["poses", "velocities", "velocities and biases"])
+def test_a_table_of_euroc_reads_back_bit_for_bit(tmp_path, further):
+    trajectory = random_trajectory()
+    rows = np.hstack([trajectory.poses.translation, trajectory.poses.rotation.as_quat(scalar_first=True)])
+    lines = [
+        ", ".join([str(stamp), *map(repr, row), *["0.5"] * further])
+        for stamp, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True)
+    ]
+    path = written(tmp_path / "state.csv", "#timestamp, p_RS_R_x [m], ...", *lines)
+    assert file_format(path) == "euroc"
+    for read in (read_euroc(path), read_trajectory(path, None)):
+        assert_array_equal(read.stamps_ns, trajectory.stamps_ns)
+        assert_allclose(read.poses.as_matrix(), trajectory.poses.as_matrix(), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("1.5,0,0,0,1,0,0,0", "not a time in nanoseconds"),
+        ("2,0,0,0,1,0,0", "7 columns where 8 are expected"),
+        ("2,0,0,0,2,0,0,0", "not a rotation"),
+        ("2,0,0,nan,1,0,0,0", "not a finite number"),
+        ("0,0,0,0,1,0,0,0", "not later than"),
+    ],
+)
+def test_what_is_wrong_with_a_table_of_euroc_is_named_by_line(tmp_path, line, reason):
+    path = written(tmp_path / "state.csv", "#timestamp", "1,0,0,0,1,0,0,0", line)
+    with pytest.raises(LogError, match=reason):
+        read_trajectory(path, None)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import functools
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from typing import NamedTuple
 import lz4.frame
 import numpy as np
 import zstandard
+from mcap.records import Schema
 from numpy.typing import NDArray
 
 from fusion_io.errors import LogError
@@ -26,6 +27,9 @@ RECORD = struct.Struct("<BQ")  # opcode, length of the contents
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
 
 _CACHED_BLOCKS = 4
+
+#: Brings a message of another encoding into ROS 2's CDR; it raises ValueError for one that is malformed.
+ToCdr = Callable[[bytes | memoryview], bytes | memoryview]
 
 
 class Channel(NamedTuple):
@@ -48,20 +52,26 @@ class Block(NamedTuple):
 class MessageIndex:
     """The messages of a topic in order of recording: header stamps, log times (ns) and places, (N,) each.
 
-    A stamp is 0 where the header has none, and means nothing for messages without a header.
+    A stamp is 0 where the header has none, and means nothing for messages without a header. ``to_cdr``: what the
+    messages have to pass when they are fetched, None where they are ROS 2's already.
     """
 
     stamps_ns: IntArray
     log_times_ns: IntArray
     blocks: IntArray
     offsets: IntArray
+    to_cdr: ToCdr | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     def __getitem__(self, selection: IntArray | NDArray[np.bool_]) -> MessageIndex:
-        return MessageIndex(
-            self.stamps_ns[selection], self.log_times_ns[selection], self.blocks[selection], self.offsets[selection]
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[selection],
+            log_times_ns=self.log_times_ns[selection],
+            blocks=self.blocks[selection],
+            offsets=self.offsets[selection],
         )
 
 
@@ -76,11 +86,13 @@ class Damage(NamedTuple):
 class Contents:
     """All that was found in a file.
 
-    ``counts`` has every channel with messages; ``index``, by topic, those that were asked for. ``messages_lost`` is
-    what the file itself says it once held, less what could be read.
+    ``counts`` has every channel with messages, ``schemas`` the definition of their messages where there is one;
+    ``index``, by topic, those that were asked for. ``messages_lost`` is what the file itself says it once held, less
+    what could be read.
     """
 
     counts: Mapping[Channel, int]
+    schemas: Mapping[Channel, Schema]
     index: Mapping[str, MessageIndex]
     blocks: Sequence[Block]
     metadata: dict[str, dict[str, str]]
@@ -105,12 +117,13 @@ class MessageFile:
     ) -> None:
         self._file.close()
 
-    def read(self, index: MessageIndex, i: int) -> memoryview:
-        """The data of the i-th message of an index."""
+    def read(self, index: MessageIndex, i: int) -> bytes | memoryview:
+        """The data of the i-th message of an index; ValueError where it has to be brought into CDR and cannot be."""
         contents = memoryview(self._unpacked(int(index.blocks[i])))
         start = int(index.offsets[i]) + RECORD.size
         _, length = RECORD.unpack_from(contents, start - RECORD.size)
-        return contents[start + MESSAGE.size : start + length]
+        data = contents[start + MESSAGE.size : start + length]
+        return index.to_cdr(data) if index.to_cdr else data
 
     def _unpack(self, number: int) -> bytes:
         block = self._blocks[number]

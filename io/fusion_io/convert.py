@@ -1,7 +1,7 @@
 """Convert recordings into logs: ``python -m fusion_io.convert <kind of recording> ... --out X.mcap``.
 
 Whatever was missing or skipped is counted and printed as one warning on stderr. Exit codes: 0 the log is
-written, 1 it could not be, 2 usage.
+written, 1 it could not be, 2 usage, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, UsageError
+from fusion_io.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, FusionError, UsageError
 
 if TYPE_CHECKING:
     from fusion_io.images import Framing
@@ -42,14 +42,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)
-        return EXIT_FAILED
+        return EXIT_INTERRUPTED
 
 
 # ------------------------------------------------------------------------------------------------- arguments
 
 
 def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m fusion_io.convert", description="Convert a recording into a log.")
+    parser = argparse.ArgumentParser(
+        prog="python -m fusion_io.convert",
+        description="Convert a recording into a log.",
+        epilog="Exit codes: 0 the log is written, 1 it could not be, 2 usage, 130 interrupted.",
+    )
     kinds = parser.add_subparsers(title="kinds of recording", required=True, metavar="KIND")
 
     _add_odometry_arguments(_add_kind(kinds, "kitti-odometry", "a sequence of the odometry benchmark", _open_odometry))

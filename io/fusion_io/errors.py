@@ -19,3 +19,5 @@ EXIT_OK = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_DAMAGED = 3
+EXIT_DIFFERS = 4  # a condition that was set for the results does not hold
+EXIT_INTERRUPTED = 130  # as shells report Ctrl-C: 128 and the number of the signal

@@ -35,3 +35,8 @@ class Findings:
     def notes(self) -> list[str]:
         """All notes."""
         return [note for _, notes in self._found.values() for note in notes]
+
+    @property
+    def remarks(self) -> list[str]:
+        """The notes that are no faults."""
+        return [note for count, notes in self._found.values() if not count for note in notes]

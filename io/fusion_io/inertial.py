@@ -12,6 +12,14 @@ from fusion_io.records import FloatArray, IntArray
 # A sample between two others that lie further apart than this many usual periods would be invented.
 MAX_GAP_PERIODS = 5
 
+# No sensor shows as much, in rad/s or m/s^2: it is garbage, and its square may not be finite.
+LARGEST_READING = 1e6
+
+
+def measurable(values: FloatArray) -> NDArray[np.bool_]:
+    """Which rows of values (N, M) can have been measured: all of their numbers are finite and not absurdly large."""
+    return np.asarray(np.all(np.abs(values) < LARGEST_READING, axis=1))
+
 
 def longest_increasing(stamps: IntArray) -> IntArray:
     """Indices of a longest strictly increasing subsequence, in O(n log n).

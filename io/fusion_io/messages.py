@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from fusion_io.errors import LogError
-from fusion_io.records import NANOSECONDS, CameraInfo, FloatArray, GnssFix, PairEstimate
+from fusion_io.records import NANOSECONDS, CameraInfo, EstimatorSeries, FloatArray, GnssFix, PairEstimate
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -31,13 +31,16 @@ IMU = "sensor_msgs/msg/Imu"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
+PATH = "nav_msgs/msg/Path"
 GNSS = "sensor_msgs/msg/NavSatFix"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PAIR_ESTIMATE = "violearner_msgs/msg/PairEstimate"
+ESTIMATOR_STATE = "violearner_msgs/msg/EstimatorState"
 
 CAMERA_FRAME = "camera"
 IMU_FRAME = "imu"
 WORLD_FRAME = "world"
+WORLD_FLU_FRAME = "world_flu"  # the world with x forward, y left, z up: what viewers take for upright (REP 103)
 
 SCHEMA_ENCODING = "ros2msg"
 MESSAGE_ENCODING = "cdr"
@@ -63,8 +66,35 @@ float64[] errors                    # photometric error of each hypothesis
 float64 imu_coverage                # share of the IMU window that was measured rather than filled, 0 to 1
 """
 
+ESTIMATOR_STATE_DEFINITION = """\
+# What a back end estimated at one frame beside its pose; NaN where it has nothing to say. *_std: standard deviations.
+std_msgs/Header header              # stamp of the frame; frame_id: the camera
+
+# Of the IMU, in its own axes.
+geometry_msgs/Vector3 gyro_bias                 # rad/s
+geometry_msgs/Vector3 gyro_bias_std
+geometry_msgs/Vector3 accelerometer_bias        # m/s^2
+geometry_msgs/Vector3 accelerometer_bias_std
+
+# Of the pair estimates: their translations are too long by scale_error (0.01 is 1 %), and they turn too fast by
+# rate_bias, in camera axes.
+float64 scale_error
+float64 scale_error_std
+geometry_msgs/Vector3 rate_bias                 # rad/s
+geometry_msgs/Vector3 rate_bias_std
+
+# What the pair estimate that ends at this frame shows beyond what was predicted, in the axes of the target camera.
+geometry_msgs/Vector3 innovation_rotation       # rad
+geometry_msgs/Vector3 innovation_translation    # m
+float64 nis                         # its square, normalised by its covariance: 6 on average where all is modelled right
+bool used                           # false where that pair estimate was rejected
+"""
+
+_DEFINITIONS = {PAIR_ESTIMATE: PAIR_ESTIMATE_DEFINITION, ESTIMATOR_STATE: ESTIMATOR_STATE_DEFINITION}
+
 TYPESTORE = get_typestore(Stores.ROS2_HUMBLE)
-TYPESTORE.register(get_types_from_msg(PAIR_ESTIMATE_DEFINITION, PAIR_ESTIMATE))
+for _name, _definition in _DEFINITIONS.items():
+    TYPESTORE.register(get_types_from_msg(_definition, _name))
 
 # Image encodings of sensor_msgs/image_encodings.hpp that show light, and how OpenCV turns them into grey or RGB.
 _IMAGE_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -90,10 +120,10 @@ _STAMP_BIG = struct.Struct(">iI")
 def schema_text(type_name: str) -> str:
     """The definition of a message with those it refers to, as MCAP's ``ros2msg`` encoding wants it."""
     generated: str = TYPESTORE.generate_msgdef(type_name, ros_version=2)[0]
-    if type_name != PAIR_ESTIMATE:
+    if type_name not in _DEFINITIONS:
         return generated
     _, separator, references = generated.partition("=" * 80)  # rosbags drops comments: ours are worth keeping
-    return PAIR_ESTIMATE_DEFINITION + separator + references
+    return _DEFINITIONS[type_name] + separator + references
 
 
 def header_stamp(data: bytes | memoryview, offset: int = 0) -> int:
@@ -196,7 +226,7 @@ def _compressed_depth(message: Any) -> NDArray[np.float32]:
     if not (transport and message.format.startswith("32FC1")):
         return _metres(stored)
     _, a, b = _DEPTH_TRANSPORT_HEADER.unpack_from(message.data)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         return _valid_depth(np.where(stored > 0, a / (stored - b), 0))
 
 
@@ -374,6 +404,15 @@ def encode_odometry(stamp_ns: int, pose: PoseSample, child_frame_id: str) -> byt
     )
 
 
+def encode_path(poses: Sequence[tuple[int, PoseSample]]) -> bytes:
+    """Path through at least one pose, each with its stamp in nanoseconds."""
+    stamped = [
+        _new(POSE_STAMPED, header=_header(stamp_ns, WORLD_FRAME), pose=_pose(pose.position, pose.quat_wxyz))
+        for stamp_ns, pose in poses
+    ]
+    return _serialise(PATH, header=_header(poses[0][0], WORLD_FRAME), poses=stamped)
+
+
 def decode_pose(type_name: str, data: bytes | memoryview) -> PoseSample:
     """PoseStamped, PoseWithCovarianceStamped or Odometry; a covariance of zeros is none."""
     message = _deserialise(type_name, data)
@@ -485,6 +524,47 @@ def decode_pair(data: bytes | memoryview) -> PairEstimate:
         errors=np.array(message.errors),
         imu_coverage=message.imu_coverage,
     )
+
+
+# --- States of a back end -----------------------------------------------------------------------
+
+
+def encode_estimator(series: EstimatorSeries, row: int) -> bytes:
+    """One row of a series as EstimatorState; every number is kept to the last bit."""
+    innovation = series.innovation[row]
+    return _serialise(
+        ESTIMATOR_STATE,
+        header=_header(int(series.stamps_ns[row]), CAMERA_FRAME),
+        **{name: _vector(getattr(series, name)[row]) for name in _STATE_VECTORS},
+        **{name: float(getattr(series, name)[row]) for name in _STATE_NUMBERS},
+        innovation_rotation=_vector(innovation[:3]),
+        innovation_translation=_vector(innovation[3:]),
+        used=bool(series.used[row]),
+    )
+
+
+def decode_estimator(data: bytes | memoryview) -> EstimatorSeries:
+    """EstimatorState as a series of one row."""
+    message = _deserialise(ESTIMATOR_STATE, data)
+    innovation = [_vector_array(message.innovation_rotation), _vector_array(message.innovation_translation)]
+    return EstimatorSeries(
+        stamps_ns=np.array([_nanoseconds(message.header.stamp)]),
+        **{name: _vector_array(getattr(message, name))[None] for name in _STATE_VECTORS},
+        **{name: np.array([getattr(message, name)]) for name in _STATE_NUMBERS},
+        innovation=np.concatenate(innovation)[None],
+        used=np.array([message.used]),
+    )
+
+
+_STATE_VECTORS = (
+    "gyro_bias",
+    "gyro_bias_std",
+    "accelerometer_bias",
+    "accelerometer_bias_std",
+    "rate_bias",
+    "rate_bias_std",
+)
+_STATE_NUMBERS = ("scale_error", "scale_error_std", "nis")
 
 
 # --- Satellites ---------------------------------------------------------------------------------

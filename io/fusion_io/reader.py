@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion_io import camera, inertial, messages, mounting, roles
+from fusion_io import camera, encodings, inertial, messages, mounting, roles, topics
 from fusion_io.container import Channel, Contents, MessageFile, MessageIndex
 from fusion_io.errors import LogError
 from fusion_io.findings import Findings
@@ -23,6 +23,7 @@ from fusion_io.records import (
     NANOSECONDS,
     CameraFrame,
     CameraInfo,
+    EstimatorSeries,
     FloatArray,
     GnssFix,
     ImuSeries,
@@ -40,11 +41,12 @@ _TRIED_MESSAGES = 10
 _LISTED_TOPICS = 8
 _UNIT_TOLERANCE = 0.01
 _ASYMMETRY = 1e-6
+_FARTHEST_M = 1e9  # nothing on Earth is as far away, and the square of more may not be finite
 
 _T = TypeVar("_T")
 
 
-def open_log(path: Path, topics: Mapping[str, str] | None = None) -> Log:
+def open_log(path: str | Path, topics: Mapping[str, str] | None = None) -> Log:
     """Open a log after reading it once: every chunk is checked, and every message's place noted.
 
     A damaged log is opened with what is left of it (``Log.damaged``).
@@ -81,7 +83,9 @@ class Log:
         self.metadata = contents.metadata
         self.damaged = bool(contents.damage or contents.messages_lost)
         self._contents = contents
-        self._types = {channel.topic: channel.message_type for channel in contents.counts if _readable(channel)}
+        self._channels = {channel.topic: channel for channel in contents.counts if _readable(channel)}
+        self._types = {topic: encodings.ros2_type(channel) for topic, channel in self._channels.items()}
+        self._indices: dict[str, MessageIndex] = {}
         self._findings = Findings()
         self._report_damage()
         self.roles = roles.assign(str(path), self._topics(), chosen)
@@ -115,11 +119,15 @@ class Log:
                 return self._in_time(role)[0]
         return np.zeros(0, dtype=np.int64)
 
-    def frames(self) -> Iterator[CameraFrame]:
-        """Images with depth and intrinsics in order of time: paired, scaled, undistorted. One is held at a time.
+    def frames(self, stamps_ns: IntArray | None = None) -> Iterator[CameraFrame]:
+        """Images with depth and intrinsics: paired, scaled, undistorted. One is held at a time.
+
+        stamps_ns (M,): which of ``frame_stamps``, in any order; None for all of them. Those that cannot be decoded
+        are left out, and counted when all are read.
 
         Raises:
             LogError: there are no images or no intrinsics, or depth or intrinsics cannot belong to the images.
+            ValueError: no frame has one of the stamps.
 
         """
         for role, words in (("image", "images"), ("camera_info", "camera info")):
@@ -129,10 +137,11 @@ class Log:
         info_stamps, infos = self._in_time("camera_info")
         infos = infos[camera.nearest_index(info_stamps, stamps)]
         depths, depth_of = self._depth_beside(stamps)
+        chosen = np.arange(len(stamps)) if stamps_ns is None else _places(stamps_ns, stamps)
         unreadable: list[tuple[str, int, ValueError]] = []
         with self._open() as file:
-            for i, stamp in enumerate(stamps.tolist()):
-                depth = None
+            for i in chosen.tolist():
+                stamp, depth = int(stamps[i]), None
                 try:
                     image = messages.decode_image(self._type("image"), file.read(images, i))
                 except ValueError as error:
@@ -144,7 +153,7 @@ class Log:
                 except ValueError as error:
                     unreadable.append(("depth", stamp, error))
                 yield self._frame(CameraFrame(stamp, image, depth, self._camera_info(file, infos, i)))
-        for role in ("image", "depth"):
+        for role in ("image", "depth") if stamps_ns is None else ():
             self._report_unreadable(role, [(stamp, error) for which, stamp, error in unreadable if which == role])
 
     def camera_info(self) -> CameraInfo | None:
@@ -240,29 +249,52 @@ class Log:
             columns.append(sample.angular_velocity_std or np.nan)
             columns.append(sample.linear_acceleration_std or np.nan)
         stamps, samples = np.array(recorded, dtype=np.int64), np.array(columns).reshape(-1, 8)
-        finite = np.all(np.isfinite(samples[:, needed]), axis=1)
+        finite = inertial.measurable(samples[:, needed])
         self._report(f"{role}_nan", role, stamps[~finite], "without finite values are left out")
         stamps, samples = self._increasing(role, stamps[finite], samples[finite])
         return ImuSeries(stamps, samples[:, 0:3], samples[:, 3:6], _typical(samples[:, 6]), _typical(samples[:, 7]))
 
     def ground_truth(self) -> Trajectory | None:
         """Poses to compare with, at their own stamps and in their own world; None if there are none."""
-        if "ground_truth" not in self.roles:
-            return None
-        message_type = self._type("ground_truth")
+        truth = self._poses("ground_truth") if "ground_truth" in self.roles else None
+        return None if truth is None else Trajectory(truth.stamps_ns, truth.poses)
+
+    @property
+    def trajectory_names(self) -> list[str]:
+        """The names of the results that the log holds ("raw", "posegraph", "ekf"), as `trajectory` takes them."""
+        prefix = topics.ODOMETRY_PREFIX
+        return sorted(
+            topic.removeprefix(prefix)
+            for topic, message_type in self._types.items()
+            if topic.startswith(prefix) and message_type == messages.ODOMETRY
+        )
+
+    def trajectory(self, name: str) -> Trajectory | None:
+        """A result that an earlier run wrote, with its covariances; None if there is none of this name."""
+        return self._poses(topics.ODOMETRY_PREFIX + name) if name in self.trajectory_names else None
+
+    def _poses(self, role: str) -> Trajectory | None:
+        """The valid poses of a role or topic in order of time; covariances are zero where only others have one."""
+        message_type = self._type(role)
         recorded, columns = array("q"), array("d")
-        for stamp, pose in self._decoded("ground_truth", lambda data: messages.decode_pose(message_type, data)):
+        for stamp, pose in self._decoded(role, lambda data: messages.decode_pose(message_type, data)):
             recorded.append(stamp)
             columns.extend(pose.position)
             columns.extend(pose.quat_wxyz)
-        stamps, poses = np.array(recorded, dtype=np.int64), np.array(columns).reshape(-1, 7)
-        valid = np.all(np.isfinite(poses), axis=1) & _is_unit(poses[:, 3:])
-        self._report("ground_truth_invalid", "ground_truth", stamps[~valid], "without a valid pose are left out")
-        stamps, poses = self._increasing("ground_truth", stamps[valid], poses[valid])
+            columns.extend(_NO_COVARIANCE if pose.covariance is None else pose.covariance.ravel())
+        stamps, poses = np.array(recorded, dtype=np.int64), np.array(columns).reshape(-1, 43)
+        valid = np.all(np.abs(poses[:, :3]) < _FARTHEST_M, axis=1) & _is_unit(poses[:, 3:7])
+        self._report(f"{role}_invalid", role, stamps[~valid], "without a valid pose are left out")
+        stamps, poses = self._increasing(role, stamps[valid], poses[valid])
         if not len(stamps):
             return None
-        rotations = Rotation.from_quat(poses[:, 3:], scalar_first=True)
-        return Trajectory(stamps, RigidTransform.from_components(poses[:, :3], rotations))
+        rotations = Rotation.from_quat(poses[:, 3:7], scalar_first=True)
+        covariances = poses[:, 7:].reshape(-1, 6, 6)
+        return Trajectory(
+            stamps,
+            RigidTransform.from_components(poses[:, :3], rotations),
+            covariances if covariances.any() else None,
+        )
 
     def pairs(self) -> list[PairEstimate]:
         """Recorded pair estimates in order of time, to the bit as they were written; invalid ones are left out."""
@@ -282,6 +314,14 @@ class Log:
         again = len(estimates) - len(invalid) - len(valid)
         self._findings.put(f"duplicate_{role}", again, f"{self._named(role)}: {again} messages repeat a pair")
         return [valid[key] for key in sorted(valid)]
+
+    def estimator(self, name: str) -> EstimatorSeries | None:
+        """What a back end ("posegraph", "ekf") estimated beside its trajectory, in order of time; None if not there."""
+        topic = topics.ESTIMATOR_PREFIX + name
+        if self._types.get(topic) != messages.ESTIMATOR_STATE:
+            return None
+        rows = dict(self._decoded(topic, messages.decode_estimator))
+        return EstimatorSeries.joined([rows[stamp] for stamp in sorted(rows)]) if rows else None
 
     def gnss(self) -> list[GnssFix]:
         """Position fixes in order of time."""
@@ -306,10 +346,21 @@ class Log:
     # --- Messages of a role ---------------------------------------------------------------------
 
     def _index(self, role: str) -> MessageIndex:
-        return self._contents.index[self.roles[role]]
+        topic = self._topic(role)
+        if topic not in self._indices:
+            with self._open() as file:
+                self._indices[topic] = encodings.stamped(file, self._in_cdr(topic))
+        return self._indices[topic]
+
+    def _in_cdr(self, topic: str) -> MessageIndex:
+        return encodings.in_cdr(self._contents, self._channels[topic])
 
     def _type(self, role: str) -> str:
-        return self._types[self.roles[role]]
+        return self._types[self._topic(role)]
+
+    def _topic(self, role: str) -> str:
+        """The topic of a role; a topic that plays none stands for itself."""
+        return self.roles.get(role, role)
 
     def _open(self) -> MessageFile:
         return MessageFile(self.path, self._contents.blocks)
@@ -329,7 +380,7 @@ class Log:
         self._report(f"{role}_unstamped", role, filled, "without a stamp have their log time instead")
         return stamps
 
-    def _decoded(self, role: str, decode: Callable[[memoryview], _T]) -> Iterator[tuple[int, _T]]:
+    def _decoded(self, role: str, decode: Callable[[bytes | memoryview], _T]) -> Iterator[tuple[int, _T]]:
         """Stamps and contents of a role's messages in order of recording, less those that cannot be decoded."""
         index = self._index(role)
         unreadable: list[tuple[int, ValueError]] = []
@@ -360,9 +411,9 @@ class Log:
                     return name
         return ""
 
-    def _first(self, topic: str, read: Callable[[memoryview], str]) -> tuple[str, str]:
+    def _first(self, topic: str, read: Callable[[bytes | memoryview], str]) -> tuple[str, str]:
         """What the first message says that can be read, and otherwise "" and why not."""
-        index, reason = self._contents.index[topic], ""
+        index, reason = self._in_cdr(topic), ""
         with self._open() as file:
             for i in range(min(len(index), _TRIED_MESSAGES)):
                 try:
@@ -376,8 +427,7 @@ class Log:
     def _topics(self) -> list[Topic]:
         """The topics that can be read, each with the role that it fits, judged by its first message."""
         found = []
-        for topic in self._contents.index:
-            message_type = self._types[topic]
+        for topic, message_type in self._types.items():
             kind, reason = self._first(topic, functools.partial(roles.kind_of, topic, message_type))
             found.append(Topic(topic, message_type, kind))
             if reason:
@@ -405,8 +455,13 @@ class Log:
         """A line for each of them, with file, topic and time."""
         return self._findings.notes
 
+    @property
+    def remarks(self) -> list[str]:
+        """Those of the notes that are worth knowing and no fault."""
+        return self._findings.remarks
+
     def _named(self, role: str) -> str:
-        return f"{self.path}: {self.roles[role]}"
+        return f"{self.path}: {self._topic(role)}"
 
     def _report(self, name: str, role: str, stamps: IntArray, what: str) -> None:
         """Count messages of a role, by their stamps."""
@@ -414,7 +469,7 @@ class Log:
         self._findings.put(name, len(stamps), f"{self._named(role)}: {len(stamps)} messages {what}{first}")
 
     def _report_unreadable(self, role: str, unreadable: list[tuple[int, ValueError]]) -> None:
-        if role in self.roles:
+        if self._topic(role) in self._types:
             stamps = np.array([stamp for stamp, _ in unreadable], dtype=np.int64)
             reason = unreadable[0][1] if unreadable else ""
             self._report(f"{role}_unreadable", role, stamps, f"cannot be decoded ({reason})")
@@ -444,21 +499,30 @@ class Log:
         held = [f"{topic} ({kind or 'no schema'}, {encoding})" for topic, kind, encoding in counts]
         more = f" and {len(held) - _LISTED_TOPICS} more" if len(held) > _LISTED_TOPICS else ""
         return (
-            "nothing to work with: no images, IMU, poses, positions or pair estimates as ROS 2 messages; it holds "
+            "nothing to work with: no images, IMU, poses, positions or pair estimates that can be read; it holds "
             + ", ".join(held[:_LISTED_TOPICS])
             + more
         )
 
 
 _MISSING = (np.nan, np.nan, np.nan)
+_NO_COVARIANCE = (0.0,) * 36
 
 
 def _readable(channel: Channel) -> bool:
-    return channel.message_encoding == messages.MESSAGE_ENCODING and channel.message_type in roles.READABLE_TYPES
+    return encodings.ros2_type(channel) in roles.READABLE_TYPES
 
 
 def _seconds(stamp_ns: int) -> str:
     return f"{stamp_ns / NANOSECONDS:.3f} s"
+
+
+def _places(wanted: IntArray, among: IntArray) -> IntArray:
+    """The indices of stamps (M,) among others (N,) that increase strictly."""
+    places = np.searchsorted(among, wanted)
+    if not np.isin(wanted, among).all():
+        raise ValueError("no frame has one of the stamps")
+    return places
 
 
 def _typical(deviations: FloatArray) -> float | None:
@@ -486,6 +550,7 @@ def _is_valid(pair: PairEstimate) -> bool:
         pair.source_stamp_ns < pair.target_stamp_ns
         and all(bool(np.all(np.isfinite(values))) for values in numbers)
         and bool(_is_unit(pair.quat_wxyz))
+        and bool(np.abs(pair.translation).max() < _FARTHEST_M)
         and -1 <= pair.winner < max(hypotheses, 1)
         and bool(np.abs(pair.covariance - pair.covariance.T).max() <= _ASYMMETRY * np.abs(pair.covariance).max())
         and bool(np.linalg.eigvalsh(pair.covariance)[0] > 0)

@@ -12,7 +12,8 @@ Conventions (the same in every package):
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,6 +197,12 @@ class EstimatorSeries:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @classmethod
+    def joined(cls, parts: Sequence[EstimatorSeries]) -> EstimatorSeries:
+        """One series of the rows of at least one."""
+        names = [each.name for each in fields(cls)]
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 @dataclass(frozen=True, slots=True)

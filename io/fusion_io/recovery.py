@@ -140,6 +140,11 @@ class _Scan:
                 senders.setdefault(channel, []).append(number)
         return Contents(
             counts={channel: sum(self._counts[number] for number in numbers) for channel, numbers in senders.items()},
+            schemas={
+                channel: self._schemas[schema_id]
+                for channel, numbers in senders.items()
+                if (schema_id := self._channels[numbers[0]].schema_id)
+            },
             index={
                 channel.topic: _in_order([self._indices[number] for number in numbers])
                 for channel, numbers in senders.items()

@@ -39,7 +39,7 @@ _READABLE = {
     "gnss": {messages.GNSS},
     "tf_static": {messages.TRANSFORMS},
 }
-READABLE_TYPES = frozenset().union(*_READABLE.values())
+READABLE_TYPES = frozenset({messages.ESTIMATOR_STATE}).union(*_READABLE.values())
 
 _ONLY_BY_NAME = {"loops", "tf_static"}
 _INERTIAL = ("imu", "gyro", "accelerometer")

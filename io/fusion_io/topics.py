@@ -15,6 +15,8 @@ LOOPS = "/violearner/loops"
 TF = "/tf"
 TF_STATIC = "/tf_static"
 ODOMETRY_PREFIX = "/odometry/"
+PATH_PREFIX = "/path/"
+ESTIMATOR_PREFIX = "/estimator/"
 
 CAMERA_TOPICS = frozenset({IMAGE, DEPTH, CAMERA_INFO})
 
@@ -31,7 +33,16 @@ _MESSAGE_TYPES = {
     TF_STATIC: messages.TRANSFORMS,
 }
 
+_RESULT_TYPES = {
+    ODOMETRY_PREFIX: messages.ODOMETRY,
+    PATH_PREFIX: messages.PATH,
+    ESTIMATOR_PREFIX: messages.ESTIMATOR_STATE,
+}
+
 
 def message_type(topic: str) -> str:
     """The type that we write on a topic of ours."""
-    return messages.ODOMETRY if topic.startswith(ODOMETRY_PREFIX) else _MESSAGE_TYPES[topic]
+    for prefix, result in _RESULT_TYPES.items():
+        if topic.startswith(prefix):
+            return result
+    return _MESSAGE_TYPES[topic]

@@ -3,6 +3,7 @@
 * KITTI: a line is a pose, the upper three rows of T_world_camera in row-major order (12 numbers). Some
   systems put the index of the frame in front (13). Stamps are in a file of their own, ``times.txt``.
 * TUM: a line is ``stamp tx ty tz qx qy qz qw``, the stamp in seconds.
+* EuRoC: a line is ``stamp, tx, ty, tz, qw, qx, qy, qz``, the stamp in nanoseconds; velocities and biases may follow.
 
 Blank lines and lines that begin with ``#`` are skipped. Whatever is wrong with a file is a ``LogError``
 that names the file and the line.
@@ -28,6 +29,9 @@ ROTATION_TOLERANCE = 5e-3
 
 #: Stamps beyond this do not fit into 64 bits of nanoseconds (the year 2262).
 MAX_STAMP_SECONDS = Decimal(2**63 - 1) / NANOSECONDS
+
+#: Of EuRoC's tables: with the pose alone, with velocities, and with the biases of gyro and accelerometer too.
+EUROC_COLUMNS = (8, 11, 17)
 
 
 # ----------------------------------------------------------------------------------------- tables of numbers
@@ -187,18 +191,47 @@ def read_tum(path: Path) -> Trajectory:
     rows = read_rows(path, columns=(8,))
     stamps_ns = _increasing(rows, [row.stamp_ns() for row in rows])
     numbers = np.array([row.finite(start=1) for row in rows])
-    norms = np.linalg.norm(numbers[:, 3:], axis=1)
+    return Trajectory(stamps_ns, _poses(rows, numbers[:, :3], numbers[:, 3:]))
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """A table as EuRoC's ground truth: stamps (N,) strictly increasing, poses of the body that it was made for."""
+    rows = read_rows(path, EUROC_COLUMNS, separator=",")
+    stamps_ns = _increasing(rows, [_integer_stamp(row) for row in rows])
+    numbers = np.array([row.finite(start=1)[:7] for row in rows])
+    return Trajectory(stamps_ns, _poses(rows, numbers[:, :3], numbers[:, [4, 5, 6, 3]]))
+
+
+def _integer_stamp(row: Row) -> int:
+    try:
+        return int(row.words[0])
+    except ValueError:
+        raise row.error(f"not a time in nanoseconds ({row.words[0]!r})") from None
+
+
+def _poses(rows: Sequence[Row], positions: FloatArray, quats_xyzw: FloatArray) -> RigidTransform:
+    """Poses whose quaternions are normalised, and refused where they are none."""
+    norms = np.linalg.norm(quats_xyzw, axis=1)
     bad = np.flatnonzero(np.abs(norms - 1) > ROTATION_TOLERANCE)
     if bad.size:
         raise rows[bad[0]].error(f"not a rotation (norm of the quaternion {norms[bad[0]]:.3g})")
-    poses = RigidTransform.from_components(numbers[:, :3], Rotation.from_quat(numbers[:, 3:]))
-    return Trajectory(stamps_ns, poses)
+    return RigidTransform.from_components(positions, Rotation.from_quat(quats_xyzw))
+
+
+def file_format(path: Path) -> str:
+    """The format of a trajectory file, by its first line: "tum", "kitti" or "euroc"."""
+    if "," in next((line for line in read_text(path).splitlines() if line.strip() and line.strip()[0] != "#"), ""):
+        return "euroc"
+    return "tum" if len(read_rows(path, columns=(8, 12, 13))[0].words) == 8 else "kitti"
 
 
 def read_trajectory(path: Path, frame_stamps_ns: IntArray | None) -> Trajectory:
-    """A trajectory in TUM's format (8 columns) or in KITTI's (12 or 13), which needs the stamps of the frames."""
-    if len(read_rows(path, columns=(8, 12, 13))[0].words) == 8:
-        return read_tum(path)
+    """A trajectory in the format of TUM, of EuRoC, or of KITTI, which needs the stamps of the frames."""
+    match file_format(path):
+        case "tum":
+            return read_tum(path)
+        case "euroc":
+            return read_euroc(path)
     if frame_stamps_ns is None:
         raise UsageError(f"{path}: KITTI's format has no times of its own: give --times")
     return read_kitti(path, frame_stamps_ns)

@@ -18,12 +18,23 @@ from scipy.spatial.transform import Rotation
 
 from fusion_io import messages, topics
 from fusion_io.errors import LogError
-from fusion_io.messages import CAMERA_FRAME, IMU_FRAME, WORLD_FRAME, FrameTransform, ImuSample, PoseSample
-from fusion_io.records import CameraFrame, CameraInfo, GnssFix, ImuSeries, PairEstimate, Trajectory
+from fusion_io.messages import (
+    CAMERA_FRAME,
+    IMU_FRAME,
+    WORLD_FLU_FRAME,
+    WORLD_FRAME,
+    FrameTransform,
+    ImuSample,
+    PoseSample,
+)
+from fusion_io.records import CameraFrame, CameraInfo, EstimatorSeries, GnssFix, ImuSeries, PairEstimate, Trajectory
 
 CHUNK_BYTES = 1 << 20
 # Images that wait for others with an earlier stamp: ten frames of image, depth and camera info.
 WAITING_IMAGES = 30
+
+_IDENTITY_WXYZ = np.array([1.0, 0.0, 0.0, 0.0])
+_FLU_FROM_OPTICAL_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
 
 
 class _Message(NamedTuple):
@@ -151,6 +162,17 @@ class LogWriter:
         )
         self._add_trajectory(topics.TF, trajectory, encode_transform)
 
+    def overview(self, name: str, trajectory: Trajectory) -> None:
+        """All poses of a result in one message at its beginning, for viewers that draw no trail of an odometry."""
+        if len(trajectory):
+            poses = list(_pose_samples(trajectory))
+            self._add_series(topics.PATH_PREFIX + name, iter([(poses[0][0], messages.encode_path(poses))]))
+
+    def estimator(self, name: str, series: EstimatorSeries) -> None:
+        """What a back end ("posegraph", "ekf") estimated beside its trajectory."""
+        encoded = ((int(stamp), messages.encode_estimator(series, i)) for i, stamp in enumerate(series.stamps_ns))
+        self._add_series(topics.ESTIMATOR_PREFIX + name, encoded)
+
     def pairs(self, pairs: Iterable[PairEstimate]) -> None:
         """Pair estimates of consecutive frames, in order of their target stamps."""
         self._add_pairs(topics.PAIRS, list(pairs))
@@ -170,8 +192,17 @@ class LogWriter:
     def mounting(self, rotation_imu_camera: Rotation) -> None:
         """The mounting of the IMU, ``v_imu = rotation_imu_camera.apply(v_camera)``, as a static transform."""
         quat_wxyz = rotation_imu_camera.inv().as_quat(scalar_first=True)
-        transform = FrameTransform(CAMERA_FRAME, IMU_FRAME, PoseSample(np.zeros(3), quat_wxyz))
-        self._add_series(topics.TF_STATIC, iter([(0, messages.encode_transforms(0, [transform]))]))
+        self._add_static(FrameTransform(CAMERA_FRAME, IMU_FRAME, PoseSample(np.zeros(3), quat_wxyz)))
+
+    def frame_tree(self, shown: str) -> None:
+        """For viewers: the camera rides on the trajectory of this name, and the world stands upright in `world_flu`."""
+        self._add_static(
+            FrameTransform(WORLD_FLU_FRAME, WORLD_FRAME, PoseSample(np.zeros(3), _FLU_FROM_OPTICAL_WXYZ)),
+            FrameTransform(f"{CAMERA_FRAME}_{shown}", CAMERA_FRAME, PoseSample(np.zeros(3), _IDENTITY_WXYZ)),
+        )
+
+    def _add_static(self, *transforms: FrameTransform) -> None:
+        self._add_series(topics.TF_STATIC, iter([(0, messages.encode_transforms(0, transforms))]))
 
     # --- Order of time --------------------------------------------------------------------------
 

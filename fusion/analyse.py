@@ -1,0 +1,126 @@
+"""Is this log good enough to run? ``python -m fusion.analyse LOG.mcap``: any MCAP, before a run or after."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fusion.analysis import Analysis
+    from fusion.analysis_tables import PlainTable
+
+STDOUT = "-"
+STYLES = {"ready": "bold green", "usable with limits": "bold yellow", "not usable": "bold red"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = parser().parse_args(argv)
+    try:
+        return run(arguments.log, dict(arguments.topic or ()), arguments.json, arguments.html)
+    except FusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+
+
+def run(log_path: Path, topics: dict[str, str], json_path: str | None, html_path: Path | None) -> int:
+    """Analyse one log, print or write what was found; returns the exit code.
+
+    Raises LogError for a file that is no log or cannot be read, or an output that cannot be written.
+    """
+    from fusion.analysis import analyse, document
+
+    analysis = analyse(log_path, topics)
+    text = json.dumps(document(analysis), indent=2, allow_nan=False) + "\n"
+    if html_path is not None:
+        from fusion.analysis_page import page
+
+        _write(html_path, page(analysis))
+    if json_path == STDOUT:
+        sys.stdout.write(text)
+    else:
+        if json_path is not None:
+            _write(Path(json_path), text)
+        _print(analysis)
+    return EXIT_DAMAGED if analysis.damaged else EXIT_OK
+
+
+def _print(analysis: Analysis) -> None:
+    """The verdict with its reasons, and the tables."""
+    from rich.console import Console
+    from rich.text import Text
+
+    from fusion.analysis_tables import tables
+
+    console = Console()
+    path = analysis.found.path
+    console.print(Text(f"{path.name}: {analysis.answer}", style=STYLES[analysis.answer]))
+    for reason in analysis.reasons:
+        console.print(Text(f"  {reason.level.name.lower()}: {reason.line(str(path))}"))
+    if (calibration := analysis.found.calibration) is not None and calibration.used:
+        console.print(Text(f"IMU by the pair estimates: {calibration.reason}"))
+    if analysis.revisits is not None:
+        seen = analysis.revisits
+        console.print(Text(f"Loop candidates by {seen.source}: {seen.frames} frames in {seen.stretches} stretches"))
+    for table in tables(analysis):
+        _print_table(console, table)
+
+
+def _print_table(console: Console, table: PlainTable) -> None:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    drawn = Table(title=table.title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for i, heading in enumerate(table.headings):
+        drawn.add_column(heading, justify="left" if i < table.words else "right", overflow="fold")
+    for row in table.rows:
+        drawn.add_row(*(Text(cell) for cell in row))
+    console.print(drawn)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m fusion.analyse",
+        description="Say whether a log is good enough to run, and why: times, light, depth, noise, faults, results.",
+        epilog="Exit codes: 0 analysed, whatever the verdict; 1 nothing could be read, 2 usage, 3 the log is damaged.",
+    )
+    parser.add_argument("log", type=Path, metavar="LOG.mcap", help="any MCAP file, an input or an output")
+    parser.add_argument("--json", metavar="OUT", help="write all of it as JSON; - prints it instead of the tables")
+    parser.add_argument("--html", type=Path, metavar="OUT", help="write it as one page that needs nothing else")
+    parser.add_argument(
+        "--topic",
+        type=_role_and_topic,
+        action="append",
+        metavar="ROLE=NAME",
+        help="the topic of a role where the log leaves it open, as for fusion.run; may be repeated",
+    )
+    return parser
+
+
+def _role_and_topic(text: str) -> tuple[str, str]:
+    role, equals, topic = text.partition("=")
+    if not (role and equals and topic):
+        raise argparse.ArgumentTypeError(f"{text!r} is not ROLE=NAME such as imu=/imu/data")
+    return role, topic
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""The trajectories that a log holds, of whoever computed them: every topic of odometry or of poses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from fusion_io import encodings, messages, topics
+from fusion_io.container import Channel, Contents, MessageFile
+from fusion_io.errors import LogError
+from fusion_io.inertial import longest_increasing
+from fusion_io.messages import PoseSample
+from fusion_io.records import Trajectory
+from fusion_io.recovery import scan
+
+POSE_TYPES = (messages.ODOMETRY, messages.POSE_STAMPED, messages.POSE_WITH_COVARIANCE)
+UNIT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedTrajectories:
+    """The trajectories of a log by name, its ground truth, and what else is told about them.
+
+    A name is that of the result for topics of ours (``/odometry/ekf`` is ``ekf``), and otherwise the topic's with an
+    underscore for all that is no letter. metadata: named records of text. damaged: the file is not as it was written.
+    notes: a line for everything that was left out.
+    """
+
+    trajectories: Mapping[str, Trajectory]
+    ground_truth: Trajectory | None
+    metadata: Mapping[str, Mapping[str, str]]
+    damaged: bool
+    notes: tuple[str, ...]
+
+
+def read_trajectories(path: Path) -> RecordedTrajectories:
+    """Read all odometry and poses of a log; topics with fewer than two poses are none.
+
+    Poses that are not finite or whose quaternion is none, and those that go back in time, are left out and counted.
+    Raises LogError for a file that is no MCAP file. Whether there is any trajectory is for the caller to judge.
+    """
+    contents = scan(path, _is_trajectory)
+    notes = [damage.note for damage in contents.damage]
+    channels = {channel.topic: channel for channel in contents.counts if _is_trajectory(channel)}
+    found: dict[str, Trajectory] = {}
+    for topic in sorted(contents.index, key=_order):
+        samples, left_out = _samples(path, contents, channels[topic])
+        trajectory = _trajectory(samples)
+        left_out += len(samples) - len(trajectory)
+        if left_out:
+            notes.append(f"{path}: {topic}: {left_out} poses are left out: unreadable, invalid or out of order")
+        if len(trajectory) > 1:
+            found[topic] = trajectory
+    ground_truth = found.pop(topics.GROUND_TRUTH, None)
+    named: dict[str, Trajectory] = {}
+    for topic, trajectory in found.items():
+        name = name_of(topic)
+        named[name if name not in named else f"{name}_{len(named)}"] = trajectory
+    damaged = bool(contents.damage or contents.messages_lost)
+    return RecordedTrajectories(named, ground_truth, contents.metadata, damaged, tuple(notes))
+
+
+def name_of(topic: str) -> str:
+    """The name of the trajectory on a topic: an identifier."""
+    name = re.sub(r"\W", "_", topic.removeprefix(topics.ODOMETRY_PREFIX).strip("/")) or "trajectory"
+    return f"_{name}" if name[0].isdigit() else name
+
+
+def _order(topic: str) -> tuple[int, str]:
+    """Ours as a run writes them, then those of others by name."""
+    ours = ("raw", "posegraph", "posegraph_online", "ekf", "ekf_smoothed")
+    name = topic.removeprefix(topics.ODOMETRY_PREFIX)
+    return (ours.index(name) if name in ours else len(ours), topic)
+
+
+def _is_trajectory(channel: Channel) -> bool:
+    return encodings.ros2_type(channel) in POSE_TYPES
+
+
+def _samples(path: Path, contents: Contents, channel: Channel) -> tuple[list[tuple[int, PoseSample]], int]:
+    """Stamps (the log time where there is none) and poses in order of recording, and how many are no poses."""
+    samples, invalid = [], 0
+    message_type = encodings.ros2_type(channel)
+    with MessageFile(path, contents.blocks) as file:
+        index = encodings.stamped(file, encodings.in_cdr(contents, channel))
+        stamps_ns = np.where(index.stamps_ns == 0, index.log_times_ns, index.stamps_ns)
+        for i, stamp_ns in enumerate(stamps_ns.tolist()):
+            try:
+                pose = messages.decode_pose(message_type, file.read(index, i))
+            except ValueError:
+                invalid += 1
+                continue
+            if _is_valid(pose):
+                samples.append((stamp_ns, pose))
+            else:
+                invalid += 1
+    return samples, invalid
+
+
+def _is_valid(pose: PoseSample) -> bool:
+    unit = abs(float(np.linalg.norm(pose.quat_wxyz)) - 1.0) < UNIT_TOLERANCE
+    known = pose.covariance is None or bool(np.all(np.isfinite(pose.covariance)))
+    return unit and known and bool(np.all(np.isfinite(pose.position)))
+
+
+def _trajectory(samples: list[tuple[int, PoseSample]]) -> Trajectory:
+    """The longest run of samples in order of time; with covariances where one of them states any."""
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in samples], dtype=np.int64)
+    kept = longest_increasing(stamps_ns)
+    poses = [samples[i][1] for i in kept.tolist()]
+    positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
+    quats = np.array([pose.quat_wxyz for pose in poses]).reshape(-1, 4)
+    covariances = None
+    if any(pose.covariance is not None for pose in poses):  # the first pose may well state zero: it is the world
+        covariances = np.stack([np.zeros((6, 6)) if pose.covariance is None else pose.covariance for pose in poses])
+    rotations = Rotation.from_quat(quats, scalar_first=True)
+    return Trajectory(stamps_ns[kept], RigidTransform.from_components(positions, rotations), covariances)
+
+
+def only_trajectory(path: Path, recorded: RecordedTrajectories) -> Trajectory:
+    """The ground truth of a log, or the one trajectory that it holds; raises LogError where neither is there."""
+    if recorded.ground_truth is not None:
+        return recorded.ground_truth
+    if len(recorded.trajectories) == 1:
+        return next(iter(recorded.trajectories.values()))
+    names = ", ".join(recorded.trajectories) or "none"
+    raise LogError(f"{path}: which of its trajectories is the ground truth? It holds {names}")
