@@ -45,6 +45,19 @@ class ImuWindow(NamedTuple):
         return reduce(mul, Rotation.from_rotvec((self.angular_velocity - bias) * self.durations[:, None]))
 
 
+def turned(windows: Sequence[ImuWindow], bias: FloatArray) -> FloatArray:
+    """The rotation vectors (N, 3) of what the gyro, less its bias (3,) rad/s, turned during N windows."""
+    pieces = max((len(window.durations) for window in windows), default=0)
+    rotvecs = np.zeros((len(windows), pieces, 3))
+    for row, window in zip(rotvecs, windows, strict=True):
+        row[: len(window.durations)] = (window.angular_velocity - bias) * window.durations[:, None]
+    increments = Rotation.from_rotvec(rotvecs.reshape(-1, 3)).as_matrix().reshape(-1, pieces, 3, 3)
+    whole = np.tile(np.eye(3), (len(windows), 1, 1))
+    for piece in range(pieces):
+        whole = whole @ increments[:, piece]
+    return np.asarray(Rotation.from_matrix(whole).as_rotvec())
+
+
 class ImuWindows:
     """The samples of an IMU over any interval of time, linear between them."""
 

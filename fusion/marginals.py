@@ -7,12 +7,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from fusion_io.records import FloatArray
+
+
+class Joint(NamedTuple):
+    """The joint covariance of some variables, and where the rows of each begin and end."""
+
+    covariance: FloatArray
+    rows: dict[int, tuple[int, int]]
+
+    def of(self, keys: Sequence[int]) -> FloatArray:
+        """The joint covariance of some of them, in this order."""
+        index = [row for key in keys for row in range(*self.rows[key])]
+        return np.asarray(self.covariance[np.ix_(index, index)])
 
 
 def covariances(net: gtsam.GaussianBayesNet, wanted: Callable[[int], Sequence[int] | None]) -> dict[int, FloatArray]:
@@ -23,40 +35,48 @@ def covariances(net: gtsam.GaussianBayesNet, wanted: Callable[[int], Sequence[in
     which it is known already (Kaess and Dellaert, "Covariance recovery from a square root information matrix", 2009).
     """
     conditionals = [net.at(i) for i in range(net.size())]
-    place = {conditional.keys()[0]: i for i, conditional in enumerate(conditionals)}
-    parents = [sorted(conditional.keys()[1:], key=place.__getitem__) for conditional in conditionals]
-    children = Counter(of[0] for of in parents if of)
+    keys = [list(conditional.keys()) for conditional in conditionals]
+    place = {of[0]: i for i, of in enumerate(keys)}
+    nearest = [min(of[1:], key=place.__getitem__, default=None) for of in keys]
+    children = Counter(nearest)
 
     found: dict[int, FloatArray] = {}
-    known: dict[int, tuple[dict[int, slice], FloatArray]] = {}
-    for conditional, above in zip(reversed(conditionals), reversed(parents), strict=True):
-        key, *order = conditional.keys()
-        root_inverse = solve_triangular(conditional.R(), np.eye(len(conditional.R())))
-        own = root_inverse @ root_inverse.T
-        if order:
-            where, covariance = known[above[0]]
-            of_parents = _part(covariance, where, order)
-            by_parents = -root_inverse @ conditional.S()
-            crossed = by_parents @ of_parents
-            own += crossed @ by_parents.T
-            own = (own + own.T) / 2  # what is left of rounding would grow from variable to variable
-            joint = np.block([[own, crossed], [crossed.T, of_parents]])
-            widths = [len(own), *(where[parent].stop - where[parent].start for parent in order)]
-            children[above[0]] -= 1
-            if not children[above[0]]:
-                del known[above[0]]
-        else:
-            joint, widths = own, [len(own)]
-        ends = np.cumsum([0, *widths])
-        known_here = {k: slice(a, b) for k, a, b in zip([key, *order], ends[:-1], ends[1:], strict=True)}
+    known: dict[int | None, Joint] = {None: Joint(np.zeros((0, 0)), {})}
+    for conditional, (key, *parents), near in zip(
+        reversed(conditionals), reversed(keys), reversed(nearest), strict=True
+    ):
+        above = known[near]
+        joint = _joined(conditional, key, parents, above.of(parents), above.rows)
+        children[near] -= 1
+        if not children[near]:
+            del known[near]
         if children[key]:
-            known[key] = known_here, joint
+            known[key] = joint
         if named := wanted(key):
-            found[key] = _part(joint, known_here, named)
+            found[key] = joint.of(named)
     return found
 
 
-def _part(covariance: FloatArray, where: dict[int, slice], keys: Sequence[int]) -> FloatArray:
-    """The rows and columns of some variables."""
-    index = np.concatenate([np.arange(where[key].start, where[key].stop) for key in keys])
-    return np.asarray(covariance[np.ix_(index, index)])
+def _joined(
+    conditional: gtsam.GaussianConditional,
+    key: int,
+    parents: Sequence[int],
+    of_parents: FloatArray,
+    rows_above: dict[int, tuple[int, int]],
+) -> Joint:
+    """A variable joined to its parents: R x + S p = d + noise."""
+    root_inverse = np.linalg.inv(conditional.R())
+    n = len(root_inverse)
+    by_parents = -root_inverse @ conditional.S()
+    crossed = by_parents @ of_parents
+    own = root_inverse @ root_inverse.T + crossed @ by_parents.T
+    covariance = np.empty((n + len(of_parents), n + len(of_parents)))
+    covariance[:n, :n] = (own + own.T) / 2  # what is left of rounding would grow from variable to variable
+    covariance[:n, n:], covariance[n:, :n] = crossed, crossed.T
+    covariance[n:, n:] = of_parents
+    rows, end = {key: (0, n)}, n
+    for parent in parents:
+        start, stop = rows_above[parent]
+        rows[parent] = (end, end + stop - start)
+        end += stop - start
+    return Joint(covariance, rows)

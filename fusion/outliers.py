@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from fusion.chain import ImuWindow, motions_of
+from fusion.chain import ImuWindow, motions_of, turned
 from fusion_io.records import FloatArray, PairEstimate
 
 # Nothing that carries a camera changes its velocity faster than this from one pair to its neighbours.
@@ -47,8 +47,8 @@ def suspects(
         return Suspects(imu_wrong, pair_wrong)
 
     by_pair = (motions.rotation.as_rotvec() / seconds)[measured]
-    turned = [window.rotation(gyro_bias).as_rotvec() for window in windows if window is not None]
-    by_gyro = rotation_imu_camera.inv().apply(turned) / seconds[measured]
+    by_imu = turned([window for window in windows if window is not None], gyro_bias)
+    by_gyro = rotation_imu_camera.inv().apply(by_imu) / seconds[measured]
     agree = _without_outliers(by_gyro - by_pair, claimed[measured], gate_probability)
     time = np.array([step.source_stamp_ns for step in steps])[measured]
     smooth = np.stack([np.interp(time, time[agree], axis) for axis in by_gyro[agree].T], axis=1)

@@ -44,8 +44,8 @@ MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance i
 
 MAX_ITERATIONS = 30
 FORGIVING_ITERATIONS = 2  # before anything is judged
-CONVERGED = 1e-5  # rad, m: a step that moves no pose further ends the iteration
-ANNEALING = 4.0  # of the kernel's width from step to step
+CONVERGED = 3e-4  # root mean square of a step over all variables, that is mostly m, that ends the iteration
+ANNEALING = 10.0  # of the kernel's width from step to step
 REJECTED_WEIGHT = 1e-4  # of a measurement that is left out: no more than a hint, where nothing else is known
 
 

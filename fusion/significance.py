@@ -68,9 +68,10 @@ def paired_difference(a: SegmentErrors, b: SegmentErrors, measure: str) -> Diffe
     """
     if not len(a.start):
         return None
-    differences = np.asarray(getattr(b, measure) - getattr(a, measure))
+    differences = np.asarray(getattr(b, measure) - getattr(a, measure), dtype=np.float64)
     starts, of_start = np.unique(a.start, return_inverse=True)
-    sums, counts = np.bincount(of_start, differences), np.bincount(of_start).astype(np.float64)
+    counts = np.bincount(of_start).astype(np.float64)
+    sums = np.bincount(of_start, differences).astype(np.float64)
     reach = np.searchsorted(starts, a.end) - of_start  # starts that lie inside of each segment, at least its own
     return mean_difference(sums, counts, int(np.ceil(np.sum(reach**2) / np.sum(reach))))
 
