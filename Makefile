@@ -1,13 +1,15 @@
 # make demo   install into .venv and run the main job on the sample log
 # make test   install, then lint, types and tests
 # make bench  benchmarks: print figures, assert nothing
+# make results  every figure of docs/results.md from recordings (an hour or more; needs ../shared/data)
+# make docs   the documentation as a site in runs/site
 
 PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test lint types bench clean
+.PHONY: demo test lint types bench results docs clean
 
 demo: $(STAMP)
 	$(PY) -m fusion.run --log samples/kitti06.mcap --config samples/kitti06.toml --out runs/demo --segment-lengths 10,20,30,40,50
@@ -28,6 +30,8 @@ bench: $(STAMP)
 	$(PY) benchmarks/simulator.py
 	$(PY) benchmarks/claims.py
 	$(PY) benchmarks/covariance.py
+	$(PY) benchmarks/consistency.py
+	$(PY) benchmarks/online.py
 
 # The stamp is older than these files when the installation no longer matches them.
 $(STAMP): pyproject.toml constraints.txt
@@ -35,6 +39,12 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $(STAMP)
+
+results: $(STAMP)
+	$(PY) benchmarks/results.py
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -10,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from fusion import chain, fusing
 from fusion.config import RunConfig
+from fusion.gnss import positions
 from fusion.imu import calibrate
 from fusion_io.errors import LogError
 from fusion_io.findings import Findings
-from fusion_io.records import ImuSeries, IntArray, PairEstimate, Trajectory
+from fusion_io.records import GnssFix, ImuSeries, IntArray, PairEstimate, Trajectory
 
 Backend = Literal["raw", "posegraph", "ekf"]
 
@@ -28,6 +30,7 @@ def fuse(
     *,
     frame_stamps: IntArray | None = None,
     mounting: Rotation | None = None,
+    gnss: Sequence[GnssFix] = (),
     config: RunConfig | None = None,
 ) -> Trajectory:
     """The trajectory of the camera, with covariances, from the motions between its frames and an IMU.
@@ -41,6 +44,7 @@ def fuse(
         backend: "posegraph", "ekf", or "raw" for the chained pairs without any fusion.
         frame_stamps: Stamps (N,) in ns of all frames, where pairs do not lead through all of them (`log.frame_stamps`).
         mounting: The rotation that turns camera vectors into IMU vectors, where it is known (`log.mounting`).
+        gnss: Satellite positions of an antenna on the same carrier (`log.gnss`).
         config: The settings of the back ends; None for the defaults.
 
     Raises:
@@ -55,6 +59,7 @@ def fuse(
     known = fusing.measurements(pairs, samples, calibration, stamps_ns, findings)
     if backend == "raw":
         return chain.chain(known.steps)
+    known = replace(known, gnss=positions(gnss, config.gnss, findings))
     estimates = fusing.fuse(known, config, findings)
     if backend not in estimates:
         raise LogError("; ".join(findings.notes))

@@ -72,8 +72,8 @@ class Condition:
             case ast.UnaryOp(operand=operand):
                 return not self._truth(operand, measures)
             case ast.Compare(left=left, ops=ops, comparators=comparators):
-                numbers = [self._number(each, measures) for each in (left, *comparators)]
-                return all(_COMPARISONS[type(op)](*sides) for op, sides in zip(ops, pairwise(numbers), strict=True))
+                numbers = (self._number(each, measures) for each in (left, *comparators))  # lazily, as Python
+                return all(_COMPARISONS[type(op)](*sides) for op, sides in zip(ops, pairwise(numbers), strict=False))
         raise AssertionError(ast.dump(node))
 
     def _number(self, node: ast.expr, measures: Measures) -> float:

@@ -42,6 +42,7 @@ class TopicsConfig(Section):
     accelerometer: str | None = None
     ground_truth: str | None = None
     pairs: str | None = None
+    skips: str | None = None
     loops: str | None = None
     gnss: str | None = None
     tf_static: str | None = None
@@ -52,13 +53,15 @@ class FrontendConfig(Section):
 
     auto: those recorded in the log if it has any, otherwise the network. weights: a checkpoint of the network, or
     None for the one that ships with the package. adapt: whether the network is first adapted to the log's images.
-    refine: whether its estimates are refined to the photometric optimum at full resolution.
+    refine: whether its estimates are refined to the photometric optimum at full resolution. skips: whether pairs that
+    skip one frame are estimated as well, which takes as long again.
     """
 
     mode: FrontendMode = "auto"
     weights: Path | None = None
     adapt: bool = False
     refine: bool = True
+    skips: bool = True
 
 
 class ImuConfig(Section):
@@ -210,10 +213,30 @@ class LoopsConfig(Section):
     translation_floor_m: PositiveFloat = 0.05
 
 
+class GnssConfig(Section):
+    """What is known of a satellite receiver; use = false leaves its positions out.
+
+    sigma (m): of fixes that state no covariance, per axis. antenna: where it is in camera axes (x right, y down, z
+    ahead; m), to given_antenna_sigma; where that is not known it is estimated, and lies within antenna_sigma of the
+    camera. time_offset_s is t_gnss - t_camera of one event.
+    """
+
+    use: bool = True
+    sigma: PositiveFloat = 5.0
+    antenna: tuple[float, float, float] | None = None
+    given_antenna_sigma: PositiveFloat = 0.02
+    antenna_sigma: PositiveFloat = 1.0
+    time_offset_s: float = 0.0
+
+
 class RunConfig(Section):
-    """Everything that decides the result of a run besides the log itself."""
+    """Everything that decides the result of a run besides the log itself.
+
+    online: the pose graph runs as a fixed-lag smoother too, which gives what was known at each instant.
+    """
 
     backend: Backend = "both"
+    online: bool = False
     record: Record = "light"
     segment_lengths_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = KITTI_SEGMENT_LENGTHS_M
     topics: TopicsConfig = TopicsConfig()
@@ -222,6 +245,7 @@ class RunConfig(Section):
     posegraph: PoseGraphConfig = PoseGraphConfig()
     ekf: EkfConfig = EkfConfig()
     loops: LoopsConfig = LoopsConfig()
+    gnss: GnssConfig = GnssConfig()
 
 
 def load(path: Path | None, overrides: dict[str, Any]) -> RunConfig:

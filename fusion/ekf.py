@@ -2,7 +2,8 @@
 
 The nominal state lives outside the filter, which estimates its error (filterpy): the IMU moves the nominal state and
 spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
-moved into the nominal state; then the present pose becomes the clone. Everything is causal.
+moved into the nominal state; then the present pose becomes the clone. Everything is causal. Loops and satellite
+positions are not used: they are the pose graph's.
 
 Error state (37): attitude, position, velocity, gyro bias, accelerometer bias, direction of gravity (2), scale error and
 rate bias of the front end (4), mounting, lever arm, time offset and misalignment (10), attitude and position of the
@@ -28,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
@@ -36,9 +38,9 @@ from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import EkfConfig
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Measurements, Mounting
-from fusion.pair_model import Prediction, camera, difference, exp, predict, right_jacobian, skew
+from fusion.pair_model import Prediction, adjoint, camera, difference, exp, inverse, predict, right_jacobian, skew
 from fusion.standstill import STILL_SIGMA, standing_still
-from fusion_io.records import EstimatorSeries, FloatArray, PairEstimate, Trajectory
+from fusion_io.records import EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 
@@ -205,8 +207,14 @@ class Filter:
     """The nominal state, and the covariance of its error in filterpy's filter, through prediction and update."""
 
     def __init__(
-        self, config: EkfConfig, calibration: ImuCalibration | None, mounting: Mounting | None, scale_sigma: float
+        self,
+        config: EkfConfig,
+        calibration: ImuCalibration | None,
+        mounting: Mounting | None,
+        scale_sigma: float,
+        camera_twist: FloatArray,
     ) -> None:
+        """camera_twist (6,): of the camera at first, in its own axes, rotation first; it need not be exact."""
         self.config = config
         zero = np.zeros(3)
         T_camera_imu, gyro_bias = np.eye(4), zero
@@ -231,12 +239,15 @@ class Filter:
         if mounting is not None:
             P[MOUNTED, MOUNTED] = mounting.covariance
         self.front_end_s = np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3])
-        R, p = T_camera_imu[:3, :3], T_camera_imu[:3, 3]
+        twist = adjoint(inverse(T_camera_imu)) @ camera_twist
+        moved = np.asarray(RigidTransform.from_exp_coords(ahead_s * twist).as_matrix())
+        first = T_camera_imu @ inverse(moved)
+        R, p = first[:3, :3], first[:3, 3]
         self.state = State(
             R,
             p,
-            zero,
-            zero,
+            R @ twist[3:],
+            twist[:3],
             gyro_bias,
             zero,
             np.eye(3),
@@ -244,17 +255,17 @@ class Filter:
             T_camera_imu,
             ahead_s,
             misalignment,
-            pose(R, p),
-            np.zeros(6),
+            first,
+            twist,
         )
         self.knows_gravity = False
         self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
         self.kf.x = np.zeros(DIMENSION)
-        # The first camera is the world itself, so that the IMU's first pose errs as its mounting does.
+        # The first camera is the world itself, so that the IMU's first pose errs as its mounting and its clock do.
+        by_extrinsics = np.column_stack([adjoint(moved), -twist])
         tie = np.eye(DIMENSION)
-        for attitude, position in ((ATTITUDE, POSITION), (CLONE_ATTITUDE, CLONE_POSITION)):
-            tie[attitude, MOUNTING] = np.eye(3)
-            tie[position, LEVER_ARM] = R
+        tie[ATTITUDE, EXTRINSICS] = tie[CLONE_ATTITUDE, EXTRINSICS] = by_extrinsics[:3]
+        tie[POSITION, EXTRINSICS] = tie[CLONE_POSITION, EXTRINSICS] = R @ by_extrinsics[3:]
         self.kf.P = tie @ P @ tie.T
         self.trail = p  # of the IMU
         self.trail_covariance = self.kf.P[POSITION, POSITION].copy()
@@ -282,14 +293,15 @@ class Filter:
     def update(self, measured: Measurement) -> None:
         """Correct by a measurement since the clone (Joseph form), move the error into the state and reset it."""
         shown = self.state.shown(measured.seconds)
+        H = shown_jacobian(self.state, shown)
         self.kf.update(
             measured.motion,
-            HJacobian=lambda _: shown_jacobian(self.state, shown),
+            HJacobian=lambda _: H,
             Hx=lambda _: shown.motion,
             R=measured.covariance,
             residual=lambda motion, prediction: difference(prediction, motion[None])[0],
         )
-        self._move_error(shown_jacobian(self.state, shown))
+        self._move_error(H)
 
     def stand_still(self) -> None:
         """Correct by the knowledge that the IMU does not move (zero-velocity update)."""
@@ -332,7 +344,12 @@ class Filter:
         P[VELOCITY], P[:, VELOCITY] = 0.0, 0.0
         P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
         self.kf.P = P
+        self.trail_cross = self.trail_cross.copy()
         self.trail_cross[:, VELOCITY] = 0.0
+
+    def doubt_gyro_bias(self, sigma: float) -> None:
+        """Make the gyro's bias that much (rad/s) more uncertain: it has stepped."""
+        self.kf.P[GYRO_BIAS, GYRO_BIAS] += sigma**2 * np.eye(3)
 
     def camera(self) -> tuple[FloatArray, FloatArray]:
         """The pose of the camera (4, 4) on the trail, and its covariance (6, 6), rotation first, right perturbation."""
@@ -346,6 +363,12 @@ class Filter:
         crossed = by_trail @ self.trail_cross @ J.T
         of_trail = by_trail @ self.trail_covariance @ by_trail.T
         return cameras[0], J @ self.kf.P @ J.T + crossed + crossed.T + of_trail
+
+    def mounting(self) -> Mounting:
+        """How the IMU is mounted, as far as it is known by now."""
+        state = self.state
+        covariance = self.kf.P[MOUNTED, MOUNTED].copy()
+        return Mounting(state.T_camera_imu, state.ahead_s, state.misalignment, covariance)
 
     def std(self, part: slice) -> FloatArray:
         """The standard deviations of a part of the error."""
@@ -371,7 +394,7 @@ class Filter:
         F = np.eye(DIMENSION)
         F[ATTITUDE, ATTITUDE] = turn.T
         F[POSITION, VELOCITY] = np.eye(3) * seconds
-        variances = np.zeros(DIMENSION)
+        variances = seconds * self.imu_walk
         variances[ATTITUDE] = self.config.angular_acceleration**2 * seconds**3
         self._spread(F[None], variances[None], self.config.acceleration, np.array([seconds]))
 
@@ -412,21 +435,24 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     windows = [samples.over(step.source_stamp_ns, step.target_stamp_ns) if samples else None for step in steps]
     if not any(window is not None for window in windows):
         calibration = None
-    still = standing_still(steps, windows)
-    ekf = Filter(config, calibration, measurements.mounting, config.scale_sigma(steps))
+    still = standing_still(steps, windows, np.zeros(3) if calibration is None else calibration.gyro_bias)
+    first_twist = steps[0].T_source_target.as_exp_coords() / steps[0].duration_s
+    ekf = Filter(config, calibration, measurements.mounting, config.scale_sigma(steps), first_twist)
     gate = chi2.isf(config.gate_probability, 6)
     rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [ekf.camera()]
     in_a_row = 0
     for step, motion, window, stands in zip(steps, motions_of(steps).as_matrix(), windows, still, strict=True):
         pair = Measurement(motion, step.covariance + _by_stamps(step, config.stamp_jitter_s), step.duration_s)
-        before = ekf.state, ekf.kf.P
+        if calibration is not None and np.any(_during(calibration.bias_steps_ns, step)):
+            ekf.doubt_gyro_bias(calibration.gyro_bias_std)
+        before = ekf.state, ekf.kf.P, ekf.trail_cross
         ekf.predict(window, pair.seconds)
         innovation, nis = ekf.squared_innovation(pair)
         used = nis <= gate or in_a_row >= config.max_rejected_in_a_row
         if nis <= gate:
             in_a_row = 0
         elif used:  # so many cannot all be wrong: it is the prediction that is
-            ekf.state, ekf.kf.P = before
+            ekf.state, ekf.kf.P, ekf.trail_cross = before
             ekf.forget_velocity()
             ekf.predict(None, pair.seconds)
         else:
@@ -451,7 +477,13 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
         _note(measured, len(steps), rejected),
         rejected,
         series if calibration is not None else _without_biases(series),
+        mounting=ekf.mounting() if calibration is not None else None,
     )
+
+
+def _during(stamps_ns: IntArray, step: PairEstimate) -> NDArray[np.bool_]:
+    """Which stamps (M,) fall into a step."""
+    return np.asarray((stamps_ns >= step.source_stamp_ns) & (stamps_ns < step.target_stamp_ns))
 
 
 def _by_stamps(pair: PairEstimate, jitter_s: float) -> FloatArray:

@@ -93,9 +93,9 @@ def export(log: Log, images: Log, exports: Exports) -> None:
 def tables(log: Log) -> dict[str, Table]:
     """All time series of a log by name, each a mapping of column names to equally long columns.
 
-    Names: imu, ground_truth, pairs, loops, trajectory_NAME, errors_NAME (against the ground truth), estimator_NAME.
-    Every table begins with stamp_ns, the log's clock, and time_s, seconds since the log's first frame. What the log
-    does not have is absent.
+    Names: imu, ground_truth, pairs, skips, loops, trajectory_NAME, errors_NAME (against the ground truth),
+    estimator_NAME. Every table begins with stamp_ns, the log's clock, and time_s, seconds since the log's first frame.
+    What the log does not have is absent.
     """
     imu, truth = log.imu(), log.ground_truth()
     found: dict[str, tuple[IntArray, Table]] = {}
@@ -103,7 +103,7 @@ def tables(log: Log) -> dict[str, Table]:
         found["imu"] = imu.stamps_ns, _imu_columns(imu)
     if truth is not None:
         found["ground_truth"] = truth.stamps_ns, _pose_columns(truth)
-    for name, pairs in (("pairs", log.pairs()), ("loops", log.loops())):
+    for name, pairs in (("pairs", log.pairs()), ("skips", log.skips()), ("loops", log.loops())):
         if pairs:
             found[name] = _pair_table(pairs)
     for name in log.trajectory_names:

@@ -161,6 +161,7 @@ class GnssFactors(Batch):
         super().__init__([[X(int(i)), X(int(i) + 1), U(0), L(0)] for i in before], 3)
         self._positions, self._before, self._share = positions_m, before, share[:, None]
         self._whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
+        self.residual = np.zeros((len(before), 3))
 
     def _evaluate(self, values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
         poses, antenna = poses_of(values), values.atVector(L(0))
@@ -176,9 +177,9 @@ class GnssFactors(Batch):
             by_poses.append(share[:, :, None] * (R_enu @ by_pose))
             by_antenna += share[:, :, None] * (R_enu @ R)
         by_frame = np.concatenate([-R_enu @ skew(in_world), np.broadcast_to(R_enu, by_antenna.shape)], axis=2)
-        errors = in_world @ R_enu.T + T_enu_world[:3, 3] - self._positions
+        self.residual = in_world @ R_enu.T + T_enu_world[:3, 3] - self._positions
         return (
-            np.einsum("nij,nj->ni", self._whiteners, errors),
+            np.einsum("nij,nj->ni", self._whiteners, self.residual),
             [self._whiteners @ each for each in (*by_poses, by_frame, by_antenna)],
         )
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fusion import chain, ekf, posegraph
+from fusion import chain, ekf, online, posegraph
 from fusion.config import RunConfig
 from fusion.imu import ImuCalibration, in_camera_axes, on_camera_clock
 from fusion.measurements import Estimate, Measurements
@@ -18,7 +18,8 @@ from fusion_io.records import ImuSeries, IntArray, PairEstimate
 
 def back_ends(config: RunConfig) -> Sequence[str]:
     """The names of the back ends that are asked for."""
-    return ("posegraph", "ekf") if config.backend == "both" else (config.backend,)
+    batch = ("posegraph", "ekf") if config.backend == "both" else (config.backend,)
+    return ("posegraph", "posegraph_online", *batch[1:]) if config.online and "posegraph" in batch else batch
 
 
 def measurements(
@@ -34,7 +35,7 @@ def measurements(
     """
     inertial = in_camera_axes(imu, calibration) if calibration.used else None
     faulty = len(calibration.faulty_ns)
-    findings.put("imu_faulty_stretches", faulty, f"stretches where the gyro contradicts the pairs, left out: {faulty}")
+    findings.put("imu_faulty_stretches", faulty, f"faulty stretches of the IMU, left out: {faulty}")
     steps, gaps = chain.bridge_gaps(frame_stamps, pairs, inertial)
     findings.put("gaps_bridged", gaps, f"gaps between pair estimates that were bridged: {gaps}")
     if not calibration.used:
@@ -42,26 +43,35 @@ def measurements(
     return Measurements(steps, on_camera_clock(imu, calibration), calibration)
 
 
+def between_steps(pairs: Sequence[PairEstimate], steps: Sequence[PairEstimate]) -> list[PairEstimate]:
+    """Those of the pairs that begin and end where steps do."""
+    stamps = set(chain.stamps_of(steps).tolist())
+    return [pair for pair in pairs if {pair.source_stamp_ns, pair.target_stamp_ns} <= stamps]
+
+
 def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str, Estimate]:
     """What the back ends that are asked for make of the measurements; one that fails is counted and left out.
 
-    The filter takes the mounting as the pose graph has refined it.
+    What is causal takes the mounting as the pose graph has refined it, and no IMU that the pose graph had to leave out.
     """
+    asked = back_ends(config)
     estimates: dict[str, Estimate] = {}
-    graph = _attempt("posegraph", known, config, findings) if "posegraph" in back_ends(config) or known.imu else None
-    if graph is not None and "posegraph" in back_ends(config):
+    graph = _attempt("posegraph", known, config, findings) if "posegraph" in asked or known.imu else None
+    if graph is not None and "posegraph" in asked:
         estimates["posegraph"] = graph
-    if "ekf" in back_ends(config):
-        refined = replace(known, mounting=graph.mounting if graph else None)
-        if filtered := _attempt("ekf", refined, config, findings):
-            estimates["ekf"] = filtered
+    refined = replace(known, mounting=graph.mounting if graph else None)
+    if graph is not None and graph.mounting is None:
+        refined = replace(known, imu=None, calibration=None)
+    for name in asked[1:] if "posegraph" in asked else asked:
+        if estimate := _attempt(name, refined, config, findings):
+            estimates[name] = estimate
     return estimates
 
 
 def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findings) -> Estimate | None:
     """The estimate of a back end; None, and counted, where it fails: the others are not lost."""
     try:
-        estimate = posegraph.solve(known, config.posegraph) if name == "posegraph" else ekf.solve(known, config.ekf)
+        estimate = _solve(name, known, config)
         if not np.all(np.isfinite(estimate.trajectory.poses.as_matrix())):
             raise FloatingPointError("a pose is not finite")
     except (FusionError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:  # GTSAM raises RuntimeError
@@ -70,3 +80,9 @@ def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findin
     rejected = estimate.rejected
     findings.put(f"{name}_rejected", rejected, f"measurements rejected as outliers ({name}): {rejected}")
     return estimate
+
+
+def _solve(name: str, known: Measurements, config: RunConfig) -> Estimate:
+    if name == "ekf":
+        return ekf.solve(known, config.ekf)
+    return (posegraph if name == "posegraph" else online).solve(known, config.posegraph)

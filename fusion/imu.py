@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import f as f_distribution
 from scipy.stats import rankdata
 
+from fusion import clocks, sensors
 from fusion.chain import MAX_IMU_PERIODS
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate
 
@@ -47,12 +48,17 @@ MAX_ROTATION_STD_RAD = float(np.deg2rad(2.0))
 MAX_TIME_OFFSET_STD_S = 0.02
 GRAVITY_RANGE = (8.8, 10.8)  # m/s^2, for the median magnitude that the accelerometer shows
 MAX_FAULTY_SHARE = 0.2
+MAX_CLIPPED_SHARE = 0.5
 
-# A gyro that runs in exactly equal steps on all axes for so many samples was not measured: it hung, or somebody filled
-# a gap by interpolation, as KITTI's odometry files are in places for 1.5 s. So few samples may kink in between.
-FILLED_SAMPLES = 20
-FILLED_KINK = 3
-EQUAL_STEPS = 1e-9  # rad/s
+# Stamps and pairs tell when a clock jumped to about so well.
+JUMP_GUARD_S = 1.0
+
+# A gyro's bias steps where the means of batches before and after differ by more than their scatter explains.
+MAX_BIAS_STEPS = 3
+STEP_BATCH_S = 5.0  # as long as errors of pairs are correlated
+STEP_MIN_PAIRS = 20  # on either side
+STEP_MIN_BATCHES = 5
+STEP_CHANCE = 1e-6
 
 # Where gyro and pairs disagree for long, the gyro is at fault too: front ends fail for single pairs, but an IMU that
 # saturates or loses its clock does so for a while.
@@ -84,6 +90,14 @@ CONVERGED = 1e-9
 ROTATION, BIAS, OFFSET = slice(0, 3), slice(3, 6), slice(6, 7)  # of the parameters of (1)
 
 
+class Change(NamedTuple):
+    """From at_ns on (the IMU's clock as recorded) its stamps are by clock_ns, and its gyro is by bias (3,), further."""
+
+    at_ns: int
+    clock_ns: int
+    bias: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
@@ -92,7 +106,8 @@ class ImuCalibration:
     gyro_bias (3,) rad/s in IMU axes, zero for a gyro that seems to have been corrected already. used, reason: the
     verdict and what led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad
     (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2):
-    intervals on the IMU's clock in which the gyro was not measured, or contradicts the pairs for long.
+    intervals on the IMU's clock in which the gyro was not measured, or contradicts the pairs for long. changes: where
+    the clock jumped or the bias stepped; the offset and the bias above are those before the first.
     """
 
     rotation_imu_camera: Rotation | None
@@ -104,6 +119,16 @@ class ImuCalibration:
     time_offset_std_s: float = 0.0
     gyro_bias_std: float = 0.0
     faulty_ns: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    changes: Sequence[Change] = ()
+
+    @property
+    def bias_steps_ns(self) -> IntArray:
+        """When the bias stepped (M,), on the camera's clock."""
+        offset_ns = round(self.time_offset_s * NANOSECONDS)
+        jumped = np.cumsum([change.clock_ns for change in self.changes], dtype=np.int64)
+        at_ns = np.array([change.at_ns for change in self.changes], dtype=np.int64)
+        stepped = np.array([bool(np.any(change.bias)) for change in self.changes], dtype=np.bool_)
+        return np.asarray((at_ns - jumped - offset_ns)[stepped])
 
     @property
     def mounting(self) -> Rotation:
@@ -127,10 +152,12 @@ def calibrate(
     problem = _sensor_problem(imu)
     if problem:
         return left_out(problem)
-    filled_ns = _filled_in(imu)
-    imu = _outside(imu, filled_ns)
+    not_measured_ns = _not_measured(imu)
+    imu = _outside(imu, not_measured_ns)
     if len(imu) < MIN_PAIRS:
-        return left_out("its gyro hangs")
+        return left_out("its sensors hang or are at the end of their range")
+    changes, doubtful_ns = _clock_jumps(imu, pairs)
+    imu = _unchanged(_outside(imu, doubtful_ns), changes)
     gyro, turns = _Gyro(imu), _turns(pairs, int(imu.stamps_ns[0]))
     offset_s, correlation = _correlate(gyro, turns) if time_offset_s is None else (time_offset_s, 1.0)
     covered = gyro.measured(turns.source_s + offset_s, turns.target_s + offset_s)
@@ -143,30 +170,36 @@ def calibrate(
     if time_offset_s is None and abs(offset_s) >= MAX_TIME_OFFSET_S:
         return left_out(f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's")
 
-    fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
+    estimate_offset = time_offset_s is None
+    fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=estimate_offset)
+    fit, steps, bias_std = _without_bias_steps(imu, fit, rotation, estimate_offset=estimate_offset)
+    steps = [step._replace(at_ns=_as_recorded(step.at_ns, changes)) for step in steps]
+    changes = sorted([*changes, *steps], key=lambda change: change.at_ns)
     learned = any(pair.winner >= 0 for pair in pairs)
     problem = _fit_problem(fit, MAX_SCALE_ERROR_LEARNED if learned else MAX_SCALE_ERROR)
-    gyro_bias, gyro_bias_std = _gyro_bias(fit)
+    gyro_bias, gyro_bias_std = (fit.gyro_bias, bias_std) if steps else _gyro_bias(fit)
     if learned:  # a few percent of a lasting turn look like a bias
         rate = np.mean(fit.turns.turned, axis=0) / np.mean(fit.turns.target_s - fit.turns.source_s)
         gyro_bias_std = float(np.hypot(gyro_bias_std, MAX_SCALE_ERROR_LEARNED * np.linalg.norm(rate)))
-    faulty_ns = np.concatenate([filled_ns, fit.faulty_intervals() + imu.stamps_ns[0]])
+    contradicted = [_as_recorded(at_ns, changes) for at_ns in (fit.faulty_intervals() + imu.stamps_ns[0]).ravel()]
+    faulty_ns = np.concatenate([not_measured_ns, doubtful_ns, np.array(contradicted, dtype=np.int64).reshape(-1, 2)])
     return ImuCalibration(
         fit.rotation_imu_camera,
         fit.time_offset_s,
         gyro_bias,
         used=problem is None,
-        reason=problem or _summary(fit, len(faulty_ns)),
+        reason=problem or _summary(fit, len(faulty_ns), changes),
         rotation_std_rad=fit.std[ROTATION],
         time_offset_std_s=float(fit.std[OFFSET][0]),
         gyro_bias_std=gyro_bias_std,
         faulty_ns=faulty_ns,
+        changes=changes,
     )
 
 
 def on_camera_clock(imu: ImuSeries, calibration: ImuCalibration) -> ImuSeries:
-    """The IMU on the camera's clock, in its own axes, without its faulty stretches."""
-    good = _outside(imu, calibration.faulty_ns)
+    """The IMU on the camera's clock, in its own axes, without its faulty stretches and what changed meanwhile."""
+    good = _unchanged(_outside(imu, calibration.faulty_ns), calibration.changes)
     return replace(good, stamps_ns=good.stamps_ns - round(calibration.time_offset_s * NANOSECONDS))
 
 
@@ -263,21 +296,56 @@ def _sensor_problem(imu: ImuSeries) -> str | None:
         stuck = np.ptp(values, axis=0) == 0.0
         if np.any(stuck):
             return f"its {name} is stuck: {'xyz'[int(np.argmax(stuck))]} never changes"
+        clipped = sum(run.stop - run.start for _, _, run in sensors.clipped(values)) / len(imu)
+        if clipped > MAX_CLIPPED_SHARE:
+            return f"its {name} is at the end of its range for {min(clipped, 1.0):.0%} of the time"
     shown = float(np.median(np.linalg.norm(imu.linear_acceleration, axis=1)))
     if not GRAVITY_RANGE[0] <= shown <= GRAVITY_RANGE[1]:
         return f"its accelerometer does not show gravity, but {shown:.3g} m/s^2 (median magnitude)"
     return None
 
 
-def _filled_in(imu: ImuSeries) -> IntArray:
-    """The intervals (M, 2) in nanoseconds in which the gyro was not measured."""
-    if len(imu) < FILLED_SAMPLES:
-        return np.zeros((0, 2), dtype=np.int64)
-    equal = np.max(np.abs(np.diff(imu.angular_velocity, 2, axis=0)), axis=1) <= EQUAL_STEPS
-    lasting = binary_opening(binary_closing(equal, np.ones(FILLED_KINK + 1)), np.ones(FILLED_SAMPLES))
-    inner = np.pad(lasting, 1)  # a sample has a step on either side
-    runs = [run[0] for run in find_objects(label(inner)[0])]
-    return np.array([(imu.stamps_ns[run][0], imu.stamps_ns[run][-1]) for run in runs], dtype=np.int64).reshape(-1, 2)
+def _not_measured(imu: ImuSeries) -> IntArray:
+    """The intervals (M, 2) in nanoseconds in which a sensor hung, was filled in, or was at the end of its range."""
+    found = []
+    for values in (imu.angular_velocity, imu.linear_acceleration):
+        found += [*sensors.frozen(values), *(run for _, _, run in sensors.clipped(values))]
+    found.sort(key=lambda run: (run.start, run.stop))
+    return np.array([(imu.stamps_ns[run][0], imu.stamps_ns[run][-1]) for run in found], dtype=np.int64).reshape(-1, 2)
+
+
+def _clock_jumps(imu: ImuSeries, pairs: Sequence[PairEstimate]) -> tuple[list[Change], IntArray]:
+    """Where the IMU's clock jumped, and the intervals (M, 2) about it whose samples may be of before or after."""
+    changes, doubtful = [], []
+    guard_ns = round(JUMP_GUARD_S * NANOSECONDS)
+    for jump in clocks.jumps(imu, pairs):
+        at_ns = jump.at_ns + round(jump.before_s * NANOSECONDS)
+        by_ns = round(jump.by_s * NANOSECONDS)
+        # A clock that goes back repeats its stamps, of which a reader keeps one or the other.
+        doubtful.append((at_ns + min(by_ns, 0) - guard_ns, at_ns + max(by_ns, 0) + guard_ns))
+        changes.append(Change(at_ns, by_ns, np.zeros(3)))
+    return changes, np.array(doubtful, dtype=np.int64).reshape(-1, 2)
+
+
+def _unchanged(imu: ImuSeries, changes: Sequence[Change]) -> ImuSeries:
+    """The samples as if clock and bias had gone on as before the first change."""
+    if not changes:
+        return imu
+    at_ns = np.array([change.at_ns for change in changes], dtype=np.int64)
+    passed = np.searchsorted(at_ns, imu.stamps_ns, side="right")
+    jumped = np.concatenate([[0], np.cumsum([change.clock_ns for change in changes], dtype=np.int64)])
+    stepped = np.vstack([np.zeros(3), np.cumsum([change.bias for change in changes], axis=0)])
+    return replace(
+        imu, stamps_ns=imu.stamps_ns - jumped[passed], angular_velocity=imu.angular_velocity - stepped[passed]
+    )
+
+
+def _as_recorded(at_ns: int, changes: Sequence[Change]) -> int:
+    """The stamp that the IMU recorded at a time on its clock as it was before the first change."""
+    for change in changes:
+        if at_ns >= change.at_ns:
+            at_ns += change.clock_ns
+    return int(at_ns)
 
 
 # ------------------------------------------------------------------------------------------------------ estimation
@@ -330,8 +398,10 @@ class _Fit:
     @property
     def scale(self) -> tuple[float, float]:
         """The pairs' turning as a multiple of the gyro's (least absolute deviations), and its standard deviation."""
-        angle = np.linalg.norm(self.predicted, axis=1)
-        along = np.sum(self.predicted * self.turns.turned, axis=1) / np.maximum(angle, np.finfo(float).tiny)
+        near = self.deviation < CONTRADICTION
+        predicted, turned = self.predicted[near], self.turns.turned[near]
+        angle = np.linalg.norm(predicted, axis=1)
+        along = np.sum(predicted * turned, axis=1) / np.maximum(angle, np.finfo(float).tiny)
         order = np.argsort(along / np.maximum(angle, np.finfo(float).tiny))
         middle = order[np.searchsorted(np.cumsum(angle[order]), angle.sum() / 2)]  # the weighted median
         scale = along[middle] / angle[middle]
@@ -428,6 +498,55 @@ def _gyro_bias(fit: _Fit) -> tuple[FloatArray, float]:
     return fit.gyro_bias, float(np.sqrt(variance))
 
 
+def _without_bias_steps(
+    imu: ImuSeries, fit: _Fit, rotation: Rotation | None, *, estimate_offset: bool
+) -> tuple[_Fit, list[Change], float]:
+    """The fit with the steps of the gyro's bias taken out, those steps, and the standard deviation of the last."""
+    steps: list[Change] = []
+    std = 0.0
+    while len(steps) < MAX_BIAS_STEPS and (found := _bias_step(fit)) is not None:
+        at_s, step, std = found
+        at_ns = int(imu.stamps_ns[0]) + round((at_s + fit.time_offset_s) * NANOSECONDS)
+        steps.append(Change(at_ns, 0, fit.rotation_imu_camera.apply(step)))
+        imu = _unchanged(imu, steps[-1:])
+        fit = _refine(_Gyro(imu), fit.turns, rotation, fit.time_offset_s, estimate_offset=estimate_offset)
+    return fit, steps, std
+
+
+def _bias_step(fit: _Fit) -> tuple[float, FloatArray, float] | None:
+    """When the gyro's bias stepped most (s, camera clock), by what (3,) in camera axes, and its standard deviation.
+
+    None where no step is beyond what batches of errors scatter by on either side (binary segmentation).
+    """
+    errors = (fit.predicted - fit.turns.turned) / (fit.turns.target_s - fit.turns.source_s)[:, None]
+    clipped = _clipped(errors)
+    number = ((fit.turns.source_s - fit.turns.source_s[0]) // STEP_BATCH_S).astype(int)
+    numbers = np.unique(number)
+    count, pairs = len(numbers), len(errors)
+    if count < STEP_MIN_BATCHES or pairs < 2 * STEP_MIN_PAIRS:
+        return None
+    passed = np.arange(STEP_MIN_PAIRS, pairs - STEP_MIN_PAIRS + 1)[:, None]
+    before = np.cumsum(clipped, axis=0)[passed[:, 0] - 1]
+    contrast = (clipped.sum(axis=0) - before) / (pairs - passed) - before / passed
+    split = int(passed[np.argmax(np.sum(contrast**2, axis=1) * (passed * (pairs - passed))[:, 0]), 0])
+    step = np.median(errors[split:], axis=0) - np.median(errors[:split], axis=0)
+
+    level = _clipped(errors - step * (np.arange(pairs) >= split)[:, None])
+    means = np.stack([level[number == k].mean(axis=0) for k in numbers])
+    share = split / pairs
+    variance = float(np.mean(np.var(means, axis=0, ddof=1))) / (count * share * (1.0 - share))
+    if step @ step < 3.0 * variance * f_distribution.isf(STEP_CHANCE, 3, 3 * (count - 2)):
+        return None
+    return float(fit.turns.source_s[split]), step, float(np.sqrt(variance))
+
+
+def _clipped(errors: FloatArray) -> FloatArray:
+    """Errors (N, 3), those that are far from their median moved nearer."""
+    median = np.median(errors, axis=0)
+    bound = CLIP * _robust_std(errors - median)
+    return np.clip(errors, median - bound, median + bound)
+
+
 def _whitened(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residual (N, 3) and Jacobian (N, 3, M) filtered so that the residual is white with unit variance, per axis.
 
@@ -478,12 +597,15 @@ def _fit_problem(fit: _Fit, max_scale_error: float) -> str | None:
     return None
 
 
-def _summary(fit: _Fit, stretches: int) -> str:
-    """One line on what was estimated, how well, and how many stretches of the IMU are faulty."""
+def _summary(fit: _Fit, stretches: int, changes: Sequence[Change]) -> str:
+    """One line on what was estimated, how well, how many stretches of the IMU are faulty and what changed."""
     rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
     mounting = f"estimated to +-{np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
     deviation = f"+-{1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
     offset = f"{1e3 * fit.time_offset_s:.1f} ms ({deviation})"
     faulty = f"; left out in {stretches} faulty stretches" if stretches else ""
     explained = f"its gyro explains {fit.explained[-1]:.1%} of the turning of {len(fit.predicted)} pairs"
-    return f"{explained}; mounting {mounting}, time offset {offset}{faulty}"
+    jumped = [f"; its clock jumps by {change.clock_ns / NANOSECONDS:+.2f} s" for change in changes if change.clock_ns]
+    steps = [np.linalg.norm(change.bias) for change in changes if not change.clock_ns]
+    stepped = [f"; its gyro's bias steps by {step:.2g} rad/s" for step in steps]
+    return f"{explained}; mounting {mounting}, time offset {offset}{faulty}{''.join(jumped + stepped)}"

@@ -215,7 +215,7 @@ def _resected(
     if spread < config.min_spread:
         return None
     pose = RigidTransform.from_matrix(found.T_source_target)
-    return Measured(pose, _covariance(pose.inv().apply(points[found.inliers]), seen, target.camera.K) + _floor(config))
+    return Measured(pose, _covariance(pose.inv().apply(points[found.inliers]), seen, target.camera.K) + floor(config))
 
 
 def _covariance(points: FloatArray, pixels: FloatArray, K: FloatArray) -> FloatArray:
@@ -259,7 +259,7 @@ def _refined(
         return measured
     start, prior = measured.T_source_target.as_matrix()[None], measured.covariance[None]
     result = refine([(prepare_full(source), prepare_full(target))], start, prior, np.zeros((0, 1, 4, 4)))
-    covariance = model.covariance(result.covariance, np.ones(1))[0] + _floor(config)
+    covariance = model.covariance(result.covariance, np.ones(1))[0] + floor(config)
     refined = Measured(RigidTransform.from_matrix(result.T_source_target[0]), covariance)
     kept = bool(result.improved[0]) and not refined.contradicts(measured, config.gate_probability)
     return refined if kept else measured
@@ -285,6 +285,6 @@ def _with_frames(trajectory: Trajectory, frame_stamps: IntArray) -> Trajectory:
     return Trajectory(trajectory.stamps_ns[kept], trajectory.poses[kept], covariances)
 
 
-def _floor(config: LoopsConfig) -> FloatArray:
+def floor(config: LoopsConfig) -> FloatArray:
     """The least covariance (6, 6), which is added to every other."""
     return np.diag(3 * [np.deg2rad(config.rotation_floor_deg) ** 2] + 3 * [config.translation_floor_m**2])

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from fusion.gnss import Georeference, Positions
 from fusion.imu import ImuCalibration
-from fusion_io.records import EstimatorSeries, FloatArray, GnssFix, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import EstimatorSeries, FloatArray, ImuSeries, PairEstimate, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +28,33 @@ class Mounting:
     misalignment: FloatArray
     covariance: FloatArray
 
+    @property
+    def rotation_imu_camera(self) -> Rotation:
+        """v_imu = R v_camera."""
+        return Rotation.from_matrix(self.T_camera_imu[:3, :3]).inv()
+
+    @property
+    def rotation_std_rad(self) -> FloatArray:
+        """(3,) about the camera's axes."""
+        R = self.T_camera_imu[:3, :3]
+        return np.asarray(np.sqrt(np.diag(R @ self.covariance[:3, :3] @ R.T)))
+
+    @property
+    def lever_arm_m(self) -> FloatArray:
+        """(3,) where the IMU is, in the camera's axes."""
+        return np.asarray(self.T_camera_imu[:3, 3])
+
+    @property
+    def lever_arm_std_m(self) -> FloatArray:
+        """(3,) along the camera's axes."""
+        R = self.T_camera_imu[:3, :3]
+        return np.asarray(np.sqrt(np.diag(R @ self.covariance[3:6, 3:6] @ R.T)))
+
+    @property
+    def ahead_std_s(self) -> float:
+        """Of ahead_s."""
+        return float(np.sqrt(self.covariance[6, 6]))
+
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
@@ -35,7 +64,7 @@ class Measurements:
     on the camera's clock, without what is faulty, and calibration: what is known of how they relate to the camera; both
     None where there is no IMU to be used. mounting: the same where a back end has refined it. skips: pair estimates
     between frames of the same steps that are further apart. loops: the same between frames where the camera came back.
-    gnss: positions of the antenna.
+    gnss: positions of an antenna.
     """
 
     steps: Sequence[PairEstimate]
@@ -44,7 +73,7 @@ class Measurements:
     mounting: Mounting | None = None
     skips: Sequence[PairEstimate] = ()
     loops: Sequence[PairEstimate] = ()
-    gnss: Sequence[GnssFix] = ()
+    gnss: Positions | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +82,8 @@ class Estimate:
 
     trajectory: with the covariance of every pose. note: one line on how the measurements were used. rejected: how many
     of them were left out as outliers. series: what was estimated beside the poses. loops_used (M,): which of the loops
-    were believed; empty for a back end that takes none. mounting: as it was refined.
+    were believed; empty for a back end that takes none. mounting: as it was refined. georeference: where on the earth
+    the world is, where positions told it.
     """
 
     trajectory: Trajectory
@@ -62,3 +92,4 @@ class Estimate:
     series: EstimatorSeries | None = None
     loops_used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     mounting: Mounting | None = None
+    georeference: Georeference | None = None

@@ -9,30 +9,32 @@ import itertools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from fusion import plots, report
 from fusion.config import RunConfig, to_toml
 from fusion.evaluation import Metrics
+from fusion.gnss import Georeference
 from fusion.imu import ImuCalibration
-from fusion.measurements import Estimate
+from fusion.measurements import Estimate, Mounting
 from fusion_io.errors import LogError, UsageError
 from fusion_io.findings import Findings
 from fusion_io.messages import CAMERA_FRAME
 from fusion_io.reader import Log
-from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, GnssFix, ImuSeries, PairEstimate, Trajectory
 from fusion_io.trajectory_files import write_kitti, write_tum
 from fusion_io.writer import LogWriter
 
 SCHEMA = 1
 LOG_NAME = "run.mcap"
-TRAJECTORIES = ("raw", "posegraph", "ekf")
+TRAJECTORIES = ("raw", "posegraph", "posegraph_online", "ekf")
 
 # What sensor_msgs/CameraInfo calls uncalibrated: K is zero.
 NOT_CALIBRATED = CameraInfo(0, 0, np.zeros((3, 3)))
@@ -59,11 +61,36 @@ class Outcome:
     metrics: Mapping[str, Metrics]
     findings: Findings
     loops: Sequence[PairEstimate] = ()
+    gnss: Sequence[GnssFix] = ()
+    skips: Sequence[PairEstimate] = ()
+
+    @property
+    def mounting(self) -> Mounting | None:
+        """How the IMU is mounted, as a back end has refined it, or None."""
+        return next((each.mounting for each in self.estimates.values() if each.mounting is not None), None)
 
     @property
     def duration_s(self) -> float:
         """The time that the log spans."""
         return (self.log.end_ns - self.log.start_ns) / NANOSECONDS
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where on the earth the world is, if the pose graph found out."""
+        return self.estimates["posegraph"].georeference if "posegraph" in self.estimates else None
+
+
+@contextmanager
+def folder_of_run(folder: Path, log_path: Path) -> Iterator[Path]:
+    """A prepared folder, which is gone again if it is new and nothing came of the run."""
+    new = not folder.exists()
+    prepare_folder(folder, log_path)
+    try:
+        yield folder
+    finally:
+        if new:
+            with suppress(OSError):  # something did
+                folder.rmdir()
 
 
 def prepare_folder(folder: Path, log_path: Path) -> Path:
@@ -92,7 +119,10 @@ def write_log(folder: Path, outcome: Outcome) -> None:
             writer.mounting(mounting)
         writer.imu(outcome.imu)
         writer.pairs(outcome.pairs)
+        writer.skips(outcome.skips)
         writer.loops(outcome.loops)
+        for fix in outcome.gnss:
+            writer.gnss(fix)
         if outcome.ground_truth is not None:
             writer.ground_truth(outcome.ground_truth)
         for name, trajectory in outcome.trajectories.items():
@@ -101,18 +131,25 @@ def write_log(folder: Path, outcome: Outcome) -> None:
             if estimate.series is not None:
                 writer.estimator(name, estimate.series)
             writer.overview(name, trajectory)
-        writer.frame_tree([*outcome.trajectories][-1])
+        on_earth = outcome.georeference
+        writer.frame_tree([*outcome.trajectories][-1], None if on_earth is None else on_earth.T_enu_world)
         _write_frames(writer, outcome)
 
 
 def write_text(folder: Path, outcome: Outcome) -> None:
-    """Write the trajectories as NAME.tum and NAME.kitti.txt, and the resolved configuration as config.toml."""
-    for name in TRAJECTORIES:
+    """Write the trajectories as NAME.tum and NAME.kitti.txt, and the resolved configuration as config.toml.
+
+    posegraph.enu is that of the pose graph on the earth, in the local frame of the satellite positions.
+    """
+    found: dict[str, Trajectory] = dict(outcome.trajectories)
+    if outcome.georeference is not None:
+        found["posegraph.enu"] = outcome.georeference.of(found["posegraph"])
+    for name in (*TRAJECTORIES, "posegraph.enu"):
         for suffix, write in ((".tum", write_tum), (".kitti.txt", write_kitti)):
             path = folder / f"{name}{suffix}"
-            if name in outcome.trajectories:
+            if name in found:
                 with _replacing(path) as temporary:
-                    write(temporary, outcome.trajectories[name])
+                    write(temporary, found[name])
             else:
                 path.unlink(missing_ok=True)  # of an earlier run into the same folder, which had this back end
     with _replacing(folder / "config.toml") as temporary:
@@ -144,7 +181,6 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
     """The content of metrics.json; what could not be computed is None. Times in `timing` are seconds."""
     log, calibration = outcome.log, outcome.calibration
     total = sum(seconds.values())
-    mounting = calibration.rotation_imu_camera
     return {
         "schema": SCHEMA,
         "log": {
@@ -158,13 +194,29 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
         },
         "trajectories": {name: _values(outcome, name) for name in outcome.metrics},
         "at_end": {name: _at_end(each) for name, each in outcome.trajectories.items()},
-        "calibration": {
-            "rotation_imu_camera_quat_wxyz": None if mounting is None else mounting.as_quat(scalar_first=True).tolist(),
-            "time_offset_s": calibration.time_offset_s,
-            "used": calibration.used,
-            "reason": calibration.reason,
-        },
+        "calibration": _calibration(calibration, outcome.mounting),
+        "gnss": None if outcome.georeference is None else _georeference(outcome.georeference),
         "timing": {**seconds, "total": total, "realtime_factor": outcome.duration_s / total},
+    }
+
+
+def _calibration(found: ImuCalibration, refined: Mounting | None) -> dict[str, Any]:
+    """How the IMU is mounted and what its clock reads; standard deviations are None where something was given."""
+    rotation = found.rotation_imu_camera if refined is None else refined.rotation_imu_camera
+    given = not np.any(found.rotation_std_rad)
+    std_rad = refined.rotation_std_rad if refined is not None else None if given else found.rotation_std_rad
+    offset_std_s = refined.ahead_std_s if refined is not None else found.time_offset_std_s or None
+    ahead_s = 0.0 if refined is None else refined.ahead_s
+    return {
+        "rotation_imu_camera_quat_wxyz": None if rotation is None else rotation.as_quat(scalar_first=True).tolist(),
+        "rotation_std_deg": None if std_rad is None else np.rad2deg(std_rad).tolist(),
+        "time_offset_s": None if found.time_offset_s is None else found.time_offset_s + ahead_s,
+        "time_offset_std_s": offset_std_s,
+        "lever_arm_m": None if refined is None else refined.lever_arm_m.tolist(),
+        "lever_arm_std_m": None if refined is None else refined.lever_arm_std_m.tolist(),
+        "gyro_bias_rad_s": found.gyro_bias.tolist(),
+        "used": found.used,
+        "reason": found.reason,
     }
 
 
@@ -214,9 +266,29 @@ def _at_end(trajectory: Trajectory) -> dict[str, Any]:
     return end
 
 
-def _provenance(outcome: Outcome) -> dict[str, dict[str, str]]:
-    """The metadata records of run.mcap: from what, how and with what it was made."""
+def _georeference(found: Georeference) -> dict[str, Any]:
+    """Where on the earth the world is; the covariance is that of T_enu_world, rotation first, right perturbation."""
+    used = int(np.sum(found.used))
+    T_enu_world = RigidTransform.from_matrix(found.T_enu_world)
     return {
+        "origin": found.origin._asdict(),
+        "T_enu_world": {
+            "quat_wxyz": T_enu_world.rotation.as_quat(scalar_first=True).tolist(),
+            "translation_m": T_enu_world.translation.tolist(),
+            "covariance": found.covariance.tolist(),
+        },
+        "antenna_m": found.antenna_m.tolist(),
+        "used": used,
+        "rejected": len(found.used) - used,
+        "residual_rms_m": found.residual_rms_m,
+    }
+
+
+def _provenance(outcome: Outcome) -> dict[str, dict[str, str]]:
+    """The metadata records of run.mcap: from what, how and with what it was made, and where on the earth that is."""
+    on_earth = outcome.georeference
+    origin = {} if on_earth is None else {name: repr(value) for name, value in on_earth.origin._asdict().items()}
+    return ({"enu_origin": origin} if origin else {}) | {
         "source": {"log": outcome.log.path.name, "sha256": outcome.log.sha256},
         "config": {"toml": to_toml(outcome.config)},
         "versions": {package: version(package) for package in PACKAGES},

@@ -116,7 +116,7 @@ def exp(vectors: FloatArray) -> FloatArray:
 
 def skew(vectors: FloatArray) -> FloatArray:
     """The matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
-    return np.tensordot(vectors, GENERATORS, axes=1)
+    return np.asarray((vectors @ GENERATORS.reshape(3, 9)).reshape(*vectors.shape, 3))
 
 
 def right_jacobian(vectors: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 STYLES: dict[str, dict[str, Any]] = {
     "raw": {"label": "raw", "color": "0.55", "linestyle": "--", "zorder": 3},  # shows on top of an equal pose graph
     "posegraph": {"label": "pose graph", "color": "#0072B2", "linestyle": "-"},
+    "posegraph_online": {"label": "pose graph, online", "color": "#CC79A7", "linestyle": (0, (5, 1))},
     "ekf": {"label": "EKF", "color": "#D55E00", "linestyle": "-."},
 }
 GROUND_TRUTH_STYLE: dict[str, Any] = {"label": "ground truth", "color": "black", "linestyle": "-", "linewidth": 1.0}

@@ -1,8 +1,9 @@
 """The pose graph back end: everything that was measured about a motion in one least-squares problem (GTSAM).
 
 Variables: the poses X of the IMU in the first camera's frame, its velocities V and biases B, the direction of gravity
-G, how it is mounted and what its clock reads E, and the lasting errors S of the front end, one state a second. The
-first camera is the world: X(0) is tied to E, so that the covariances of the camera's poses are those relative to it.
+G, how it is mounted and what its clock reads E, and the lasting errors S of the front end, one state a second; with
+satellite positions also where on the earth the world is U, and where the antenna is L. The first camera is the world:
+X(0) is tied to E, so that the covariances of the camera's poses are those relative to it.
 Without an IMU the poses are those of the camera, and without loops or positions the solution is the raw trajectory.
 
 Preintegration: Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", 2017. All linear
@@ -15,16 +16,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, E, G, S, V, X
+from gtsam.symbol_shorthand import B, E, G, L, S, U, V, X
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion import marginals, outliers
+from fusion import gnss, marginals, outliers
 from fusion.chain import ImuWindow, ImuWindows, chain
 from fusion.config import PoseGraphConfig, Robust
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
@@ -39,6 +41,8 @@ GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first d
 FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that the solver suffers
 INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
 MIN_WINDOWS = 20
+MAX_CONTRADICTED = 0.2  # share of the pairs: where more seem to be wrong, it is the IMU that is
+MAX_IMU_SQUARE = 6.0  # median of its squared errors, of which an IMU as good as its noise has less than one
 KNOT_S = 1.0  # between states of the front end
 MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance is singular but for rounding
 
@@ -128,21 +132,41 @@ def _solve(
     problem = _pairs_only(steps, start) if inertial is None else _with_imu(steps, start, windows, inertial, config)
     pairs = _add_pairs(problem, steps, problem.knots[:-1])
     pairs.weights[wrong.pair] = REJECTED_WEIGHT
-    skips = _add_pairs(problem, measurements.skips, NO_KNOT)
+    begin = np.searchsorted(problem.stamps_ns, [skip.source_stamp_ns for skip in measurements.skips])
+    skips = _add_pairs(problem, measurements.skips, problem.knots[begin])
     loops = _add_pairs(problem, measurements.loops, NO_KNOT)
     _add_front_end(problem, config.scale_sigma(steps), config)
+    tie, without_gnss = gnss.tie(problem, measurements.gnss)
     solution = minimise(problem, config)
 
+    if inertial is not None:
+        _refuse_contradiction(problem.graph, solution.values, (pairs.weights < 0.5) & ~wrong.pair)
     rejected = np.flatnonzero(pairs.weights < 0.5)
     loops_used = loops.weights >= 0.5
+    georeference = tie.georeference(problem, solution) if tie else None
+    others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
-        _note(windows, without_imu, len(rejected), loops_used),
-        len(rejected) + int(wrong.imu.sum()) + int(np.sum(~loops_used)) + int(np.sum(skips.weights < 0.5)),
+        _note(windows, without_imu, len(rejected), loops_used)
+        + gnss.note(measurements.gnss, georeference, without_gnss),
+        len(rejected) + int(wrong.imu.sum()) + sum(int(np.sum(each.weights < 0.5)) for each in others),
         series_of(problem, solution, pairs),
         loops_used,
         _mounting(problem, solution),
+        georeference,
     )
+
+
+def _refuse_contradiction(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, contradicted: NDArray[np.bool_]
+) -> None:
+    """Raise RuntimeError where a solution shows that IMU and pairs (N,) cannot both be right."""
+    if contradicted.mean() > MAX_CONTRADICTED:
+        raise RuntimeError(f"it contradicts {contradicted.sum()} of {len(contradicted)} pairs")
+    factors = (graph.at(i) for i in range(graph.size()))
+    squares = [2.0 * each.error(values) for each in factors if isinstance(each, gtsam.ImuFactorWithGravityDirection)]
+    if squares and np.median(squares) > MAX_IMU_SQUARE:
+        raise RuntimeError(f"the IMU is {np.sqrt(np.median(squares)):.1f} standard deviations off the motion")
 
 
 def check(pairs: Sequence[PairEstimate]) -> None:
@@ -236,12 +260,12 @@ def _with_imu(
     sigmas = np.repeat(
         [rotation_sigma, config.lever_arm_sigma, offset_sigma, config.pair_misalignment_sigma], [3, 3, 1, 3]
     )
-    graph.add(gtsam.PriorFactorVector(E(0), np.zeros(10), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    graph.add(gtsam.PriorFactorVector(E(0), np.zeros(10), _diagonal(sigmas)))
 
     gyro_bias_sigma = np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)
     sigmas = np.repeat([config.accelerometer_bias_sigma, gyro_bias_sigma], 3)
-    graph.add(gtsam.PriorFactorConstantBias(B(0), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
-    _add_bias_walk(graph, start.stamps_ns, knots, config)
+    graph.add(gtsam.PriorFactorConstantBias(B(0), bias, _diagonal(sigmas)))
+    _add_bias_walk(graph, start.stamps_ns, knots, calibration, config)
     _add_preintegrated(graph, windows, knots, bias, np.diff(seconds), config)
 
     twists = np.zeros((len(poses), 6))
@@ -257,13 +281,20 @@ def _with_imu(
 
 
 def _add_bias_walk(
-    graph: gtsam.NonlinearFactorGraph, stamps_ns: IntArray, knots: IntArray, config: PoseGraphConfig
+    graph: gtsam.NonlinearFactorGraph,
+    stamps_ns: IntArray,
+    knots: IntArray,
+    calibration: ImuCalibration,
+    config: PoseGraphConfig,
 ) -> None:
-    """The biases of the IMU, one state a knot, wander."""
+    """The biases of the IMU, one state a knot, wander; where the gyro's stepped, it is as uncertain as at first."""
     walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3)
-    seconds = np.diff(stamps_ns[_first(knots)]) / NANOSECONDS
-    for j, dt in enumerate(seconds):
-        noise = gtsam.noiseModel.Diagonal.Sigmas(walk * np.sqrt(dt))
+    starts_ns = stamps_ns[_first(knots)]
+    step = np.repeat([0.0, calibration.gyro_bias_std], 3)
+    for j, (start_ns, end_ns) in enumerate(pairwise(starts_ns.tolist())):
+        stepped = np.any((calibration.bias_steps_ns >= start_ns) & (calibration.bias_steps_ns < end_ns))
+        sigmas = np.hypot(walk * np.sqrt((end_ns - start_ns) / NANOSECONDS), step * stepped)
+        noise = _diagonal(sigmas)
         graph.add(gtsam.BetweenFactorConstantBias(B(j), B(j + 1), gtsam.imuBias.ConstantBias(), noise))
 
 
@@ -332,7 +363,7 @@ def _add_front_end(problem: Problem, scale_sigma: float, config: PoseGraphConfig
     seconds = np.diff(problem.stamps_ns[first]) / NANOSECONDS
     for j in range(len(first)):
         problem.values.insert(S(j), np.zeros(4))
-    problem.graph.add(gtsam.PriorFactorVector(S(0), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
+    problem.graph.add(gtsam.PriorFactorVector(S(0), np.zeros(4), _diagonal(sigma)))
     for j, dt in enumerate(seconds):
         keep = np.exp(-dt / correlation_s)
         whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
@@ -341,6 +372,11 @@ def _add_front_end(problem: Problem, scale_sigma: float, config: PoseGraphConfig
         point.insert(S(j), np.zeros(4))
         point.insert(S(j + 1), np.zeros(4))
         problem.graph.add(gtsam.LinearContainerFactor(linear, point))
+
+
+def _diagonal(sigmas: FloatArray) -> gtsam.noiseModel.Diagonal:
+    """Independent noise; not GTSAM's "smart" one, whose tiny standard deviations are constraints without covariance."""
+    return gtsam.noiseModel.Diagonal.Sigmas(sigmas, False)
 
 
 # ---------------------------------------------------------------------------------------------------- its solution
@@ -373,18 +409,18 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
     mounted = [E(0)] if values.exists(E(0)) else []
 
     def wanted(key: int) -> list[int] | None:
-        """Poses together with what they are mounted by; biases, errors of the front end, the mounting."""
+        """Poses and the antenna together with what they are mounted by; all else but velocities and gravity alone."""
         kind = chr(gtsam.Symbol(key).chr())
-        return [key, *mounted] if kind == "x" else [key] if kind in "bse" else None
+        return [key, *mounted] if kind in "xl" else [key] if kind in "bseu" else None
 
     return Solution(values, marginals.covariances(net, wanted))
 
 
 def elimination_order(problem: Problem) -> gtsam.Ordering:
     """Along time, which is best for a chain; where loops tie it up, GTSAM's heuristic. What all share comes last."""
-    shared = [key for key in (G(0), E(0)) if problem.values.exists(key)]
+    shared = [key for key in (L(0), U(0), G(0), E(0)) if problem.values.exists(key)]
     if problem.tied_up:
-        return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(problem.graph, gtsam.KeyVector(shared))
+        return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(problem.graph, gtsam.KeyVector(shared), True)
     order = gtsam.Ordering()
     inertial = problem.twists is not None
     for k in reversed(range(len(problem.knots))):

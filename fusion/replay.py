@@ -194,7 +194,7 @@ def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list
 
     Raises LogError for a log without recorded pairs.
     """
-    from fusion import chain, fusing, imu
+    from fusion import chain, fusing, gnss, imu
     from fusion.run import known_mounting
     from fusion_io.findings import Findings
 
@@ -204,7 +204,10 @@ def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list
     findings = Findings()
     calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
     known = fusing.measurements(pairs, samples, calibration, log.frame_stamps(), findings)
-    estimates = fusing.fuse(replace(known, loops=log.loops()), config, findings)
+    skips = fusing.between_steps(log.skips(), known.steps)
+    positions = gnss.positions(log.gnss(), config.gnss, findings)
+    known = replace(known, skips=skips, loops=log.loops(), gnss=positions)
+    estimates = fusing.fuse(known, config, findings)
     trajectories = {"raw": chain.chain(known.steps)} | {name: each.trajectory for name, each in estimates.items()}
     used = "used" if calibration.used else "left out"
     return trajectories, [f"IMU {used}: {calibration.reason}", *findings.notes]

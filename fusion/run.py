@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 STANDARD_OUTPUT = Path("-")
 INTERRUPTED = "interrupted"
+ADAPTED = "adapted.pt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +75,21 @@ def run(log_path: Path, out: Path | None, config: RunConfig, presentation: Prese
     Raises UsageError for a folder that cannot be used, and LogError for a log without anything to compute from.
     """
     stopwatch = Stopwatch()
-    from fusion import chain, fusing, imu, output
-    from fusion.evaluation import evaluate
-    from fusion_io.findings import Findings
+    from fusion import output
     from fusion_io.reader import open_log
 
     log = open_log(log_path, config.topics.model_dump(exclude_none=True))
-    folder = output.prepare_folder(out or default_folder(log_path), log_path)
-    samples, ground_truth = log.imu(), log.ground_truth()
+    with output.folder_of_run(out or default_folder(log_path), log_path) as folder:
+        return compute(log, folder, config, presentation, stopwatch)
+
+
+def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentation, stopwatch: Stopwatch) -> int:
+    """All that is done with a log that could be opened; the results go to the folder. Returns the exit code."""
+    from fusion import chain, fusing, gnss, imu, output
+    from fusion.evaluation import evaluate
+    from fusion_io.findings import Findings
+
+    samples, fixes, ground_truth = log.imu(), log.gnss(), log.ground_truth()
     findings = Findings()
     stopwatch.lap("read")
 
@@ -95,7 +103,16 @@ def run(log_path: Path, out: Path | None, config: RunConfig, presentation: Prese
     raw = chain.chain(known.steps)
     stopwatch.lap("raw")
 
-    known = replace(known, loops=loop_closures(log, raw, config, findings))
+    skips = skipping_pairs(log, samples, pairs, config.frontend, findings, folder)
+    stopwatch.lap("skips")
+
+    positions = gnss.positions(fixes, config.gnss, findings)
+    known = replace(
+        known,
+        skips=fusing.between_steps(skips, known.steps),
+        loops=loop_closures(log, raw, config, findings),
+        gnss=positions,
+    )
     stopwatch.lap("loops")
 
     estimates = fusing.fuse(known, config, findings)
@@ -106,7 +123,19 @@ def run(log_path: Path, out: Path | None, config: RunConfig, presentation: Prese
     stopwatch.lap("evaluation")
 
     outcome = output.Outcome(
-        log, config, samples, pairs, ground_truth, calibration, trajectories, estimates, metrics, findings, known.loops
+        log,
+        config,
+        samples,
+        pairs,
+        ground_truth,
+        calibration,
+        trajectories,
+        estimates,
+        metrics,
+        findings,
+        known.loops,
+        fixes,
+        known.skips,
     )
     output.write_log(folder, outcome)
     output.write_text(folder, outcome)
@@ -160,6 +189,32 @@ def pair_estimates(
     return pairs
 
 
+def skipping_pairs(
+    log: Log, imu: ImuSeries, pairs: Sequence[PairEstimate], config: FrontendConfig, findings: Findings, folder: Path
+) -> list[PairEstimate]:
+    """Pairs that skip a frame: those that the log has recorded, or the network's where it made the others too."""
+    if recorded := log.skips():
+        return recorded
+    by_network = config.mode == "violearner" or not log.has_pairs
+    if not (config.skips and by_network and log.has_frames) or INTERRUPTED in findings.counts:
+        return []
+    from fusion_io.messages import decode_pair, encode_pair
+    from learned.estimator import estimate_skips
+
+    adapted = folder / ADAPTED
+    weights = adapted if config.adapt and adapted.exists() else config.weights
+    frames = len(log.frame_stamps()) // 2
+    estimates = estimate_skips(
+        log, imu, weights, lambda each: progress.track(each, "pairs that skip a frame", frames), config.refine
+    )
+    skips: list[PairEstimate] = []
+    try:
+        skips.extend(decode_pair(encode_pair(skip)) for skip in estimates)
+    except KeyboardInterrupt:
+        findings.put(INTERRUPTED, 1, f"interrupted: {len(skips)} of {len(pairs)} pairs that skip a frame are there")
+    return sorted(skips, key=lambda skip: skip.target_stamp_ns)
+
+
 def loop_closures(log: Log, raw: Trajectory, config: RunConfig, findings: Findings) -> Sequence[PairEstimate]:
     """The loops that the log has recorded, or those found in its images, as they read back from their message."""
     if recorded := log.loops():
@@ -183,7 +238,7 @@ def adapted_weights(log: Log, config: FrontendConfig, folder: Path) -> Path:
     """The weights after adaptation to the log, in the folder; says on stderr what it was good for."""
     from learned.adapt import adapt
 
-    path = folder / "adapted.pt"
+    path = folder / ADAPTED
     print(adapt(log, config.weights, path), file=sys.stderr)
     return path
 
@@ -202,8 +257,10 @@ def present(folder: Path, outcome: Outcome, presentation: Presentation) -> None:
 
     stdout belongs to metrics.json where that is to go there; the table goes to stderr then.
     """
+    remarks = {*outcome.log.remarks, *outcome.findings.remarks}
     for note in (*outcome.log.notes, *outcome.findings.notes):
-        print(f"warning: {note}", file=sys.stderr)
+        if note not in remarks:
+            print(f"warning: {note}", file=sys.stderr)
     if not presentation.quiet:
         print_results(folder, outcome, sys.stderr if presentation.json == STANDARD_OUTPUT else sys.stdout)
     if presentation.json is not None:
@@ -237,6 +294,8 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
     title = f"{log.path.name}: {len(outcome.trajectories['raw'])} frames, {outcome.duration_s:.1f} s"
     metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
     print_table(Console(file=stream), title, outcome.trajectories, metrics)
+    for remark in (*log.remarks, *outcome.findings.remarks):
+        print(remark, file=stream)
     print(f"IMU {'used' if calibration.used else 'left out'}: {calibration.reason}", file=stream)
     for name, estimate in outcome.estimates.items():
         print(f"{HEADINGS[name]}: {estimate.note}", file=stream)
@@ -298,6 +357,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: runs/<log name>-<time>)")
     parser.add_argument("--backend", choices=("posegraph", "ekf", "both"), help="what fuses (default: both)")
     parser.add_argument(
+        "--online", action="store_true", default=None, help="the pose graph also as it runs on a robot, frame by frame"
+    )
+    parser.add_argument(
         "--frontend",
         choices=("auto", "violearner", "recorded"),
         help="where pair estimates come from (default: auto, those in the log if it has any, else the network)",
@@ -355,6 +417,7 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """What the command line says, in the shape of the configuration; what it leaves open is absent."""
     options = {
         "backend": arguments.backend,
+        "online": arguments.online,
         "record": arguments.record,
         "segment_lengths_m": arguments.segment_lengths,
         "topics": dict(arguments.topic) if arguments.topic else None,

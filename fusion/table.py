@@ -15,7 +15,7 @@ from fusion_io.records import Trajectory
 
 Metrics = Mapping[str, float | int | None]
 
-HEADINGS = {"raw": "raw", "posegraph": "pose graph", "ekf": "EKF"}
+HEADINGS = {"raw": "raw", "posegraph": "pose graph", "posegraph_online": "online", "ekf": "EKF"}
 
 
 @dataclass(frozen=True)

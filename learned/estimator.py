@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -44,8 +44,8 @@ class FrameSource(Protocol):
     def frame_stamps(self) -> IntArray:
         """Stamps of all frames."""
 
-    def frames(self) -> Iterator[CameraFrame]:
-        """Frames in order of time."""
+    def frames(self, stamps_ns: IntArray | None = None) -> Iterator[CameraFrame]:
+        """Frames in order of time: all, or those at these stamps."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,25 @@ def estimate_pairs(
     skipped = Counter() if skipped is None else skipped
     for inference in infer(weights_file.load(weights), frames, log.frame_stamps(), imu, skipped, refined):
         yield inference.pair
+
+
+def estimate_skips(
+    log: FrameSource,
+    imu: ImuSeries,
+    weights: Path | None = None,
+    track: Callable[[Iterator[CameraFrame]], Iterable[CameraFrame]] = iter,
+    refined: bool = True,
+) -> Iterator[PairEstimate]:
+    """Pair estimates from each frame to the one after the next, streamed: from the even frames, then from the odd ones.
+
+    track: wraps the frames in a progress display. The rest as for `estimate_pairs`.
+    """
+    loaded, stamps = weights_file.load(weights), log.frame_stamps()
+    for first in (0, 1):
+        every_other = stamps[first::2]
+        frames = iter(track(log.frames(every_other)))
+        for inference in infer(loaded, frames, every_other, imu, Counter(), refined):
+            yield inference.pair
 
 
 def infer(

@@ -1,11 +1,13 @@
 """A camera that slides along a painted wall and back: the smallest log with places that are seen twice."""
 
 from collections.abc import Iterator
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from fusion.config import Section
 from fusion_io.records import CameraFrame, CameraInfo, FloatArray, IntArray, Trajectory
 
 SECOND = 1_000_000_000
@@ -61,3 +63,11 @@ class WallLog:
         noise = np.random.default_rng(stamp_ns).normal(scale=2.0, size=image.shape)
         depth = None if stamp_ns in self.blind else np.full(image.shape, DISTANCE_M, np.float32)
         return CameraFrame(stamp_ns, np.clip(image + noise, 0, 255).astype(np.uint8), depth, CAMERA)
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def changed(config: AnySection, **values: Any) -> AnySection:
+    """A configuration with other values."""
+    return config.model_copy(update=values)

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.errors import LogError, UsageError
+from fusion_io.gnss import Receiver
 from fusion_io.kitti import open_odometry, open_raw, read_imu_mat, read_timestamps
 from fusion_io.trajectory_files import read_times
 
@@ -485,15 +486,22 @@ def test_lines_that_are_no_time_stamp_are_refused(tmp_path, line):
 
 
 def test_a_drive_has_frames_imu_and_gnss_at_their_own_stamps(drive):
-    recording = open_raw(drive, gnss=True)
+    recording = open_raw(drive, gnss=Receiver(1e-3, noise_m=1e-6))
     frames = list(recording.frames)
     assert frames[0].stamp_ns == 1_317_045_936_016_685_824
     assert frames[0].stamp_ns - recording.imu.stamps_ns[0] == 4_130_465
     assert_array_equal(recording.imu.linear_acceleration, np.tile([0.1, 0.2, 9.8], (FRAMES, 1)))
     assert_array_equal(recording.imu.angular_velocity, np.tile([0.01, 0.02, 0.03], (FRAMES, 1)))
-    assert recording.gnss[0].latitude_deg == 49
-    assert_allclose(recording.gnss[0].covariance, 0.09 * np.eye(3))
-    assert open_raw(drive).gnss == []
+    assert [fix.stamp_ns for fix in recording.gnss] == recording.imu.stamps_ns.tolist()
+    assert_allclose(recording.gnss[0].latitude_deg, 49, atol=1e-10)
+    assert_allclose(recording.gnss[0].covariance, 0.09 * np.eye(3), atol=1e-9)
+
+
+def test_the_unit_gives_fixes_or_the_ground_truth_but_not_both(drive):
+    with_fixes, without = open_raw(drive, gnss=Receiver(1.0)), open_raw(drive)
+    assert (len(with_fixes.gnss), with_fixes.ground_truth) == (1, None)
+    assert without.gnss == []
+    assert without.ground_truth is not None
 
 
 def test_ground_truth_of_a_drive_is_mercator_and_euler_angles_moved_into_the_camera(drive):

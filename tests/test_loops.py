@@ -4,17 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loop_samples import SECOND, WallLog, painted, there_and_back
+from loop_samples import SECOND, WallLog, changed, painted, there_and_back
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.loops import Keyframe, LoopsConfig, Measured, agreement, find_loops, matches, measure
-from fusion.retrieval import Features, RetrievalConfig
+from fusion.config import LoopsConfig, RetrievalConfig
+from fusion.loops import Keyframe, Measured, agreement, find_loops, floor, matches, measure
+from fusion.retrieval import Features
 from fusion_io.findings import Findings
 from fusion_io.records import CameraInfo, PairEstimate, Trajectory
 
-CONFIG = LoopsConfig(RetrievalConfig(min_time_s=5.0, min_path_m=10.0, place_m=4.0))
+CONFIG = LoopsConfig(retrieval=RetrievalConfig(min_time_s=5.0, min_path_m=10.0, place_m=4.0))
 CAMERA_640 = CameraInfo(640, 480, np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]]))
 
 
@@ -68,7 +69,7 @@ def test_loops_go_from_the_earlier_to_the_later_frame_in_order_of_their_targets(
 
 def test_loops_carry_covariances_that_cover_their_errors_and_are_never_surer_than_the_floor(loops, truth):
     for loop in loops:
-        assert np.all(np.linalg.eigvalsh(loop.covariance - 0.999 * CONFIG.floor) > 0)
+        assert np.all(np.linalg.eigvalsh(loop.covariance - 0.999 * floor(CONFIG)) > 0)
         twist = errors(loop, truth)
         assert twist @ np.linalg.solve(loop.covariance, twist) < chi2.isf(1e-3, 6)
 
@@ -89,9 +90,9 @@ def test_a_wall_that_repeats_itself_is_not_mistaken_for_one_place(truth):
     assert max(np.linalg.norm(errors(loop, truth)[3:]) for loop in found) < 0.05
 
 
-CARELESS = replace(
+CARELESS = changed(
     CONFIG,
-    retrieval=replace(CONFIG.retrieval, max_drift=10.0),
+    retrieval=changed(CONFIG.retrieval, max_drift=10.0),
     min_spread=0.0,
     min_inlier_share=0.0,
     min_depth=0.0,
@@ -106,8 +107,8 @@ def test_one_way_along_a_wall_with_the_same_poster_twice_has_no_loop(truth, side
     wall[60 : 60 + side, 840 : 840 + side] = wall[60 : 60 + side, 330 : 330 + side]
     one_way = Trajectory(truth.stamps_ns[:24], truth.poses[:24])
     log = WallLog(wall, one_way)
-    assert found_in(log, one_way, replace(CARELESS, min_inliers=12))
-    assert not found_in(log, one_way, replace(CARELESS, min_inliers=12, **check))
+    assert found_in(log, one_way, changed(CARELESS, min_inliers=12))
+    assert not found_in(log, one_way, changed(CARELESS, min_inliers=12, **check))
     assert all(getattr(LoopsConfig(), name) >= value for name, value in check.items())
 
 
@@ -158,7 +159,7 @@ MOTION = RigidTransform.from_components([0.4, -0.1, 0.8], Rotation.from_rotvec([
 
 def test_the_covariance_of_the_pose_by_features_is_that_of_its_errors():
     """Mean NEES of 60 draws within the 99.9 % bounds of the mean of chi-square with 6 degrees of freedom."""
-    exact = replace(CONFIG, rotation_floor_deg=1e-6, translation_floor_m=1e-6, reprojection_px=4.0)
+    exact = changed(CONFIG, rotation_floor_deg=1e-6, translation_floor_m=1e-6, reprojection_px=4.0)
     nees = []
     for seed in range(60):
         measured = measure(*two_views(seed, 0.8, MOTION), exact)
@@ -180,15 +181,15 @@ def test_features_on_one_small_object_are_no_loop():
     source, target = two_views(0, 0.5, MOTION)
     patch = np.all(np.abs(source.features.pixels - [320, 240]) < [140, 140], axis=1)
     small = [view._replace(features=Features(*(a[patch] for a in view.features))) for view in (source, target)]
-    few = replace(CONFIG, min_inliers=12)
+    few = changed(CONFIG, min_inliers=12)
     assert patch.sum() >= 12
-    assert measure(*small, replace(few, min_spread=0.01)) is not None
-    assert measure(*small, replace(few, min_spread=0.3)) is None
+    assert measure(*small, changed(few, min_spread=0.01)) is not None
+    assert measure(*small, changed(few, min_spread=0.3)) is None
 
 
 def test_views_too_far_apart_are_no_loop():
     views = two_views(0, 0.5, MOTION)
-    assert measure(*views, replace(CONFIG, max_distance_m=0.5)) is None
+    assert measure(*views, changed(CONFIG, max_distance_m=0.5)) is None
 
 
 def test_matches_are_mutual_and_clear():

@@ -32,6 +32,7 @@ FILES = {
     "errors.png",
     "raw.tum",
     "posegraph.tum",
+    "report.html",
     "ekf.tum",
     "raw.kitti.txt",
     "posegraph.kitti.txt",
@@ -96,6 +97,7 @@ def _write(folder: Path, outcome: output.Outcome) -> Path:
     output.write_log(folder, outcome)
     output.write_text(folder, outcome)
     output.write_plots(folder, outcome)
+    output.write_report(folder, outcome)
     output.write_metrics(folder, outcome, SECONDS)
     return folder
 
@@ -140,7 +142,12 @@ def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.O
         assert all(np.isfinite(value) for value in values.values())
     assert document["calibration"] == {
         "rotation_imu_camera_quat_wxyz": pytest.approx([0.5, -0.5, 0.5, -0.5]),
+        "rotation_std_deg": None,
         "time_offset_s": 0.065,
+        "time_offset_std_s": None,
+        "lever_arm_m": None,
+        "lever_arm_std_m": None,
+        "gyro_bias_rad_s": [0.0, 0.0, 0.0],
         "used": True,
         "reason": "it agrees with the pairs",
     }

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loop_samples import CAMERA, DISTANCE_M, SECOND, WallLog, painted, there_and_back
+from loop_samples import CAMERA, DISTANCE_M, SECOND, WallLog, changed, painted, there_and_back
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from fusion.config import RetrievalConfig
 from fusion.retrieval import (
     MAX_WIDTH,
     Features,
-    RetrievalConfig,
     Visits,
     appearance,
     candidates,
@@ -61,7 +61,7 @@ def test_a_camera_that_stands_still_has_one_keyframe_and_no_partner():
 def test_frames_that_are_near_in_time_or_along_the_path_are_never_compared():
     trajectory = at_keyframes(there_and_back(), CONFIG)
     vectors = np.ones((len(trajectory), 4), np.float32)  # everything looks the same
-    everywhere = replace(CONFIG, max_drift=10.0, candidates=100, place_m=0.1)
+    everywhere = changed(CONFIG, max_drift=10.0, candidates=100, place_m=0.1)
     path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(trajectory.poses.translation, axis=0), axis=1))])
     found = list(candidates(vectors, Visits.of(trajectory, everywhere)))
     assert len(found) > 100
@@ -103,7 +103,7 @@ def test_the_reach_grows_with_the_covariance_of_the_trajectory():
     back = there[::-1] + [12.0, 0.0, 0.0]
     poses = RigidTransform.from_translation(np.concatenate([there, back]))
     stamps = np.arange(100) * SECOND
-    strict = replace(CONFIG, max_drift=0.0)
+    strict = changed(CONFIG, max_drift=0.0)
     for sigma, expected in ((0.3, False), (3.0, True)):
         covariances = np.tile(sigma**2 * np.eye(6), (100, 1, 1))
         visits = Visits.of(Trajectory(stamps, poses, covariances), strict)

@@ -15,6 +15,7 @@ from fusion import events
 from fusion.evaluation import KITTI_SEGMENT_LENGTHS_M, Metrics
 from fusion.events import Event
 from fusion.imu import ImuCalibration
+from fusion.measurements import Mounting
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, EstimatorSeries, ImuSeries, IntArray, PairEstimate, Trajectory
 
@@ -42,8 +43,9 @@ class ReportContent:
     """All that a report shows; what is empty is said to be missing rather than drawn.
 
     trajectories: by name, raw among them. segment_lengths_m: of t_rel and r_rel. series: what a back end estimated
-    beside the poses, by its name; loops_used: which of the loops it believed (M,). topics: the name of each role.
-    warnings: counts by name, notes: a line for each. remarks: what the back ends say, by name.
+    beside the poses, by its name; mounting: of the IMU, as the pose graph refined it; loops_used: which of the loops it
+    believed (M,). topics: the name of each role. warnings: counts by name, notes: a line for each. remarks: what the
+    back ends say, by name.
     """
 
     title: str
@@ -55,6 +57,7 @@ class ReportContent:
     segment_lengths_m: Sequence[float] = KITTI_SEGMENT_LENGTHS_M
     imu: ImuSeries | None = None
     calibration: ImuCalibration | None = None
+    mounting: Mounting | None = None
     series: Mapping[str, EstimatorSeries] = field(default_factory=dict)
     loops: Sequence[PairEstimate] = ()
     loops_used: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
@@ -108,10 +111,11 @@ class ReportContent:
             if event.kind != events.STAND_STILL  # the trajectory knows better
         ]
         yield from shown
-        yield from events.clock_jumps(self.imu, self.pairs, topic)
+        jumps = events.clock_jumps(self.imu, self.pairs, topic)
+        yield from jumps
         if self.calibration is not None:
-            stuck = [event for event in shown if event.kind == events.STUCK]
-            yield from events.contradictions(self.calibration.faulty_ns, offset_s, stuck, topic)
+            known = [event for event in (*shown, *jumps) if event.kind != events.IMU_GAP]
+            yield from events.contradictions(self.calibration.faulty_ns, offset_s, known, topic)
 
     def _camera_events(self) -> Iterator[Event]:
         frames = self.topic("image" if "image" in self.topics else "camera_info")
@@ -148,6 +152,7 @@ def content_of(outcome: Outcome) -> ReportContent:
         segment_lengths_m=outcome.config.segment_lengths_m,
         imu=outcome.imu,
         calibration=outcome.calibration,
+        mounting=outcome.mounting,
         topics=log.roles,
         warnings={**log.warnings, **outcome.findings.counts},
         notes=[*log.notes, *outcome.findings.notes],

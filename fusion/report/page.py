@@ -20,6 +20,8 @@ import numpy as np
 
 from fusion.evaluation import common, errors_over_time
 from fusion.events import Event
+from fusion.imu import ImuCalibration
+from fusion.measurements import Mounting
 from fusion.report.content import ReportContent
 from fusion.report.figures import Figure, figures, sensor_stamps
 from fusion.report.verdict import Verdict, label, verdict
@@ -249,11 +251,29 @@ def _calibration(content: ReportContent) -> str:
             f" ± {1e3 * known.time_offset_std_s:.2f} ms" if known.time_offset_std_s else " (given or not estimated)"
         )
         rows.append(("time offset, IMU - camera", f"{1e3 * known.time_offset_s:.2f} ms{deviation}"))
+        if (refined := content.mounting) is not None:
+            rows += _refined(known, refined)
         bias = ", ".join(f"{1e3 * part:.3f}" for part in known.gyro_bias)
         estimated = f"{bias} mrad/s, sigma {1e3 * known.gyro_bias_std:.3f}"
         rows.append(("gyro bias x, y, z", estimated if np.any(known.gyro_bias) else "taken to be zero"))
     rows += [(label(name), remark) for name, remark in content.remarks.items() if remark]
     return _pairs_table(rows)
+
+
+def _refined(known: ImuCalibration, refined: Mounting) -> list[tuple[str, str]]:
+    """What the pose graph made of the mounting."""
+    turned = np.rad2deg((known.mounting.inv() * refined.rotation_imu_camera).as_rotvec())
+    offset_s, offset_std_s = known.time_offset_s + refined.ahead_s, refined.ahead_std_s
+    values = (
+        ("refined mounting", turned, np.rad2deg(refined.rotation_std_rad), "deg from that, about x, y, z"),
+        ("refined time offset", np.array([1e3 * offset_s]), np.array([1e3 * offset_std_s]), "ms"),
+        ("lever arm", refined.lever_arm_m, refined.lever_arm_std_m, "m, the IMU in camera axes"),
+    )
+    return [(name, f"{_with_std(found, std)} {unit}") for name, found, std, unit in values]
+
+
+def _with_std(values: FloatArray, std: FloatArray) -> str:
+    return ", ".join(f"{value:.3f} ± {deviation:.3f}" for value, deviation in zip(values, std, strict=True))
 
 
 def _events(content: ReportContent) -> str:

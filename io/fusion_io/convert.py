@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from fusion_io.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, FusionError, UsageError
 
 if TYPE_CHECKING:
+    from fusion_io.front_end_noise import FrontEndNoise
     from fusion_io.images import Framing
     from fusion_io.recording import Recording
 
@@ -106,7 +107,21 @@ def _add_raw_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calib", type=Path, metavar="DIR", help="the folder of calib_*.txt (default: the folder that the drive is in)"
     )
-    parser.add_argument("--gnss", action="store_true", help="also take the OXTS positions as GNSS fixes")
+    parser.add_argument(
+        "--gnss",
+        type=positive_number,
+        metavar="SECONDS",
+        help="take an OXTS position every so often as a GNSS fix, with noise; the log then has no ground truth, which "
+        "comes from the same unit",
+    )
+    parser.add_argument(
+        "--gnss-noise",
+        type=positive_number,
+        default=1.0,
+        metavar="M",
+        help="standard deviation of a fix, per axis, in metres (default %(default)g)",
+    )
+    parser.add_argument("--gnss-seed", type=seed, default=0, metavar="N", help="of that noise (default 0)")
     _add_kitti_arguments(parser)
 
 
@@ -164,6 +179,20 @@ def _add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RAD",
         help="standard deviation of a pair's rotation, per axis, in radians (default %(default)s, from the same)",
     )
+    parser.add_argument(
+        "--noise-seed",
+        type=seed,
+        metavar="N",
+        help="the poses are true: add the noise of a learned front end (white, and correlated from pair to pair), "
+        "whose covariance the pairs then have; they are the ground truth too, if no other is given",
+    )
+    parser.add_argument(
+        "--noise-rotation-drift",
+        type=positive_number,
+        metavar="DEG",
+        help="with --noise-seed: standard deviation of what is correlated in a pair's rotation, per axis, in degrees "
+        "(default 0.011: about the errors published for VIOLearner)",
+    )
 
 
 def _add_folder_arguments(parser: argparse.ArgumentParser) -> None:
@@ -199,6 +228,14 @@ def positive_integer(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def seed(text: str) -> int:
+    """An integer that is not negative, as an argument."""
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
     return value
 
 
@@ -259,14 +296,17 @@ def _open_odometry(args: argparse.Namespace) -> Recording:
 
 def _open_raw(args: argparse.Namespace) -> Recording:
     from fusion_io import kitti
+    from fusion_io.gnss import Receiver
 
+    if args.gnss is not None:
+        print("no ground truth beside GNSS fixes: both come from the OXTS unit", file=sys.stderr)
     return kitti.open_raw(
         args.drive,
         args.calib,
         depth=args.depth,
         frames=args.frames,
         colour=args.colour,
-        gnss=args.gnss,
+        gnss=None if args.gnss is None else Receiver(args.gnss, args.gnss_noise, args.gnss_seed),
         framing=_framing(args),
     )
 
@@ -293,14 +333,20 @@ def _framing(args: argparse.Namespace) -> Framing:
 
 def _open_trajectory(args: argparse.Namespace) -> Recording:
     from fusion_io.folder import read_imu_csv
+    from fusion_io.front_end_noise import with_noise
     from fusion_io.kitti import read_imu_mat
     from fusion_io.recording import Recording
     from fusion_io.trajectory_files import pair_estimates, read_times, read_trajectory
 
+    if args.noise_rotation_drift is not None and args.noise_seed is None:
+        raise UsageError("--noise-rotation-drift: there is no noise without --noise-seed")
     stamps_ns = None if args.times is None else read_times(args.times)
     recording = Recording()
     poses = read_trajectory(args.poses, stamps_ns)
     recording.pairs = pair_estimates(poses, args.sigma_translation, args.sigma_rotation)
+    if args.noise_seed is not None:
+        recording.pairs = with_noise(recording.pairs, args.noise_seed, _front_end_noise(args))
+        recording.ground_truth = poses
     if args.ground_truth is not None:
         recording.ground_truth = read_trajectory(args.ground_truth, stamps_ns)
     if args.imu is not None and args.imu.suffix.lower() == ".csv":
@@ -310,6 +356,13 @@ def _open_trajectory(args: argparse.Namespace) -> Recording:
             raise UsageError(f"{args.imu}: has no times of its own: give --times")
         recording.imu = read_imu_mat(args.imu, stamps_ns)
     return recording
+
+
+def _front_end_noise(args: argparse.Namespace) -> FrontEndNoise:
+    from fusion_io.front_end_noise import FrontEndNoise
+
+    drift_deg = args.noise_rotation_drift
+    return FrontEndNoise() if drift_deg is None else FrontEndNoise(rotation_drift_deg=drift_deg)
 
 
 def _provenance(args: argparse.Namespace) -> dict[str, str]:

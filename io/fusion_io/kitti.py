@@ -24,6 +24,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.errors import LogError, UsageError
+from fusion_io.gnss import Receiver
 from fusion_io.images import SUFFIXES, WHOLE, Framing
 from fusion_io.inertial import MAX_GAP_PERIODS, longest_increasing
 from fusion_io.lidar import SUFFIX as SCAN_SUFFIX
@@ -250,14 +251,15 @@ def open_raw(
     depth: DepthSource | None = None,
     frames: slice = slice(None),
     colour: bool = False,
-    gnss: bool = False,
+    gnss: Receiver | None = None,
     framing: Framing = WHOLE,
 ) -> Recording:
     """A raw drive (``..._sync``), with its OXTS unit as IMU and as ground truth.
 
     calibration: the folder of the day's ``calib_*.txt``, the drive's parent if not given. depth: by default from
-    stereo, or from the scanner where there are scans but no right camera. gnss: also take the unit's positions as
-    GNSS fixes. Ground truth keeps the stamps of the OXTS records, and is that of the chosen left camera in the
+    stereo, or from the scanner where there are scans but no right camera. gnss: a receiver
+    that sees the unit's positions. They are not ground truth for what is computed from them, so there is none then;
+    otherwise it keeps the stamps of the OXTS records, and is that of the chosen left camera in the
     frame of its first pose.
     """
     calibration = drive.absolute().parent if calibration is None else calibration
@@ -296,8 +298,10 @@ def open_raw(
     if not len(oxts.stamps_ns):
         raise LogError(f"{drive}: the images and the OXTS records do not overlap in time")
     recording.imu = oxts.imu()
-    recording.ground_truth = _of_camera(oxts.trajectory(), T_camera_imu).relative_to_first()
-    recording.gnss = oxts.gnss() if gnss else []
+    if gnss is None:
+        recording.ground_truth = _of_camera(oxts.trajectory(), T_camera_imu).relative_to_first()
+    else:
+        recording.gnss = gnss.fixes(oxts.gnss())
     return recording
 
 

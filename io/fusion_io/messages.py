@@ -40,6 +40,7 @@ ESTIMATOR_STATE = "violearner_msgs/msg/EstimatorState"
 CAMERA_FRAME = "camera"
 IMU_FRAME = "imu"
 WORLD_FRAME = "world"
+ENU_FRAME = "enu"  # east, north, up about an origin on the earth
 WORLD_FLU_FRAME = "world_flu"  # the world with x forward, y left, z up: what viewers take for upright (REP 103)
 
 SCHEMA_ENCODING = "ros2msg"

@@ -300,6 +300,10 @@ class Log:
         """Recorded pair estimates in order of time, to the bit as they were written; invalid ones are left out."""
         return self._pair_estimates("pairs")
 
+    def skips(self) -> list[PairEstimate]:
+        """Recorded pair estimates that skip a frame, in order of time; invalid ones are left out."""
+        return self._pair_estimates("skips")
+
     def loops(self) -> list[PairEstimate]:
         """Recorded loop closures in order of time; invalid ones are left out."""
         return self._pair_estimates("loops")

@@ -19,6 +19,7 @@ CANONICAL = {
     "imu": topics.IMU,
     "ground_truth": topics.GROUND_TRUTH,
     "pairs": topics.PAIRS,
+    "skips": topics.SKIPS,
     "loops": topics.LOOPS,
     "gnss": topics.GNSS,
     "tf_static": topics.TF_STATIC,
@@ -35,13 +36,15 @@ _READABLE = {
     "accelerometer": {messages.IMU},
     "ground_truth": _POSES,
     "pairs": {messages.PAIR_ESTIMATE},
+    "skips": {messages.PAIR_ESTIMATE},
     "loops": {messages.PAIR_ESTIMATE},
     "gnss": {messages.GNSS},
     "tf_static": {messages.TRANSFORMS},
 }
 READABLE_TYPES = frozenset({messages.ESTIMATOR_STATE}).union(*_READABLE.values())
 
-_ONLY_BY_NAME = {"loops", "tf_static"}
+_NOT_PAIRS = {topics.SKIPS, topics.LOOPS}
+_ONLY_BY_NAME = {"skips", "loops", "tf_static"}
 _INERTIAL = ("imu", "gyro", "accelerometer")
 
 
@@ -127,7 +130,7 @@ def _fitting(role: str, candidates: Sequence[Topic], roles: Mapping[str, str]) -
             return [candidate]
     if role in _ONLY_BY_NAME:
         return []
-    fitting = [candidate for candidate in candidates if candidate.kind == role and candidate.name != topics.LOOPS]
+    fitting = [candidate for candidate in candidates if candidate.kind == role and candidate.name not in _NOT_PAIRS]
     if role == "camera_info" and "image" in roles:
         # ROS publishes it beside the image: http://wiki.ros.org/image_transport, "camera_info" in the same namespace.
         beside = [candidate for candidate in fitting if candidate.name in _camera_info_names(roles["image"])]

@@ -11,6 +11,7 @@ IMU = "/imu"
 GROUND_TRUTH = "/ground_truth"
 GNSS = "/gnss"
 PAIRS = "/violearner/pairs"
+SKIPS = "/violearner/skips"
 LOOPS = "/violearner/loops"
 TF = "/tf"
 TF_STATIC = "/tf_static"
@@ -28,6 +29,7 @@ _MESSAGE_TYPES = {
     GROUND_TRUTH: messages.POSE_STAMPED,
     GNSS: messages.GNSS,
     PAIRS: messages.PAIR_ESTIMATE,
+    SKIPS: messages.PAIR_ESTIMATE,
     LOOPS: messages.PAIR_ESTIMATE,
     TF: messages.TRANSFORMS,
     TF_STATIC: messages.TRANSFORMS,

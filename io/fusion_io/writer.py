@@ -20,6 +20,7 @@ from fusion_io import messages, topics
 from fusion_io.errors import LogError
 from fusion_io.messages import (
     CAMERA_FRAME,
+    ENU_FRAME,
     IMU_FRAME,
     WORLD_FLU_FRAME,
     WORLD_FRAME,
@@ -27,7 +28,16 @@ from fusion_io.messages import (
     ImuSample,
     PoseSample,
 )
-from fusion_io.records import CameraFrame, CameraInfo, EstimatorSeries, GnssFix, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import (
+    CameraFrame,
+    CameraInfo,
+    EstimatorSeries,
+    FloatArray,
+    GnssFix,
+    ImuSeries,
+    PairEstimate,
+    Trajectory,
+)
 
 CHUNK_BYTES = 1 << 20
 # Images that wait for others with an earlier stamp: ten frames of image, depth and camera info.
@@ -35,6 +45,7 @@ WAITING_IMAGES = 30
 
 _IDENTITY_WXYZ = np.array([1.0, 0.0, 0.0, 0.0])
 _FLU_FROM_OPTICAL_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
+_OPTICAL_FROM_FLU_WXYZ = np.array([0.5, 0.5, -0.5, 0.5])
 
 
 class _Message(NamedTuple):
@@ -181,6 +192,10 @@ class LogWriter:
         """One pair estimate."""
         self._add_pairs(topics.PAIRS, [pair])
 
+    def skips(self, pairs: Iterable[PairEstimate]) -> None:
+        """Pair estimates that skip a frame, in order of their target stamps."""
+        self._add_pairs(topics.SKIPS, list(pairs))
+
     def loops(self, loops: Iterable[PairEstimate]) -> None:
         """Loop closures, in order of their target stamps."""
         self._add_pairs(topics.LOOPS, list(loops))
@@ -194,10 +209,19 @@ class LogWriter:
         quat_wxyz = rotation_imu_camera.inv().as_quat(scalar_first=True)
         self._add_static(FrameTransform(CAMERA_FRAME, IMU_FRAME, PoseSample(np.zeros(3), quat_wxyz)))
 
-    def frame_tree(self, shown: str) -> None:
-        """For viewers: the camera rides on the trajectory of this name, and the world stands upright in `world_flu`."""
+    def frame_tree(self, shown: str, T_enu_world: FloatArray | None = None) -> None:
+        """For viewers: the camera rides on the trajectory of this name, and the world stands upright in `world_flu`.
+
+        With T_enu_world (4, 4) the world has its place on the earth, in `enu`; a frame has no more than one parent.
+        """
+        if T_enu_world is None:
+            upright = FrameTransform(WORLD_FLU_FRAME, WORLD_FRAME, PoseSample(np.zeros(3), _FLU_FROM_OPTICAL_WXYZ))
+        else:
+            quat_wxyz = Rotation.from_matrix(T_enu_world[:3, :3]).as_quat(scalar_first=True)
+            self._add_static(FrameTransform(ENU_FRAME, WORLD_FRAME, PoseSample(T_enu_world[:3, 3], quat_wxyz)))
+            upright = FrameTransform(WORLD_FRAME, WORLD_FLU_FRAME, PoseSample(np.zeros(3), _OPTICAL_FROM_FLU_WXYZ))
         self._add_static(
-            FrameTransform(WORLD_FLU_FRAME, WORLD_FRAME, PoseSample(np.zeros(3), _FLU_FROM_OPTICAL_WXYZ)),
+            upright,
             FrameTransform(f"{CAMERA_FRAME}_{shown}", CAMERA_FRAME, PoseSample(np.zeros(3), _IDENTITY_WXYZ)),
         )
 

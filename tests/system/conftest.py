@@ -87,6 +87,7 @@ def simulated_drive() -> Callable[..., Drive]:
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs in this process draw nothing, which takes most of a small run's time; the pictures have their own tests."""
     monkeypatch.setattr("fusion.output.write_plots", lambda folder, outcome: None)
+    monkeypatch.setattr("fusion.output.write_report", lambda folder, outcome: None)
 
 
 @pytest.fixture(scope="session")

@@ -141,13 +141,32 @@ def test_the_scanner_of_a_sequence_gives_the_depth_of_the_log(odometry, tmp_path
 def test_a_raw_drive_becomes_a_log_with_its_mounting(shared_data, tmp_path, capsys):
     drive = shared_data / "kitti/raw/2011_09_26/2011_09_26_drive_0039_sync"
     out = tmp_path / "39.mcap"
-    assert main(["kitti-raw", f"--drive={drive}", "--frames=17:20", "--resize=310x94", "--gnss", f"--out={out}"]) == 0
+    assert main(["kitti-raw", f"--drive={drive}", "--frames=17:20", "--resize=310x94", f"--out={out}"]) == 0
     assert "1 frames missing (no left image), 1 frames without depth" in capsys.readouterr().err
     log = open_log(out)
     assert [frame.depth is None for frame in log.frames()] == [True, False]
     assert_allclose(log.mounting().apply([0, 0, 1]), [1, 0, 0], atol=0.03)
-    assert len(log.gnss()) == len(log.imu()) == len(log.ground_truth())
+    assert len(log.imu()) == len(log.ground_truth())
+    assert log.gnss() == []
     assert log.warnings.keys() <= {"frames_without_depth"}
+
+
+def test_fixes_of_a_raw_drive_are_noisy_and_leave_no_ground_truth(shared_data, tmp_path, capsys):
+    drive = shared_data / "kitti/raw/2011_09_26/2011_09_26_drive_0039_sync"
+    logs = []
+    for seed in (0, 1, 1):
+        out = tmp_path / f"{len(logs)}.mcap"
+        arguments = ["--frames=17:20", "--resize=310x94", "--gnss=0.2", "--gnss-noise=2", f"--gnss-seed={seed}"]
+        assert main(["kitti-raw", f"--drive={drive}", *arguments, f"--out={out}"]) == 0
+        logs.append(open_log(out))
+    assert "no ground truth beside GNSS fixes" in capsys.readouterr().err
+    assert logs[0].ground_truth() is None
+    fixes = [log.gnss() for log in logs]
+    assert 5 <= len(fixes[0]) <= 7  # in 1.2 s
+    assert min(fix.covariance[0, 0] for fix in fixes[0]) > 4.0
+    latitudes = [[fix.latitude_deg for fix in each] for each in fixes]
+    assert latitudes[1] == latitudes[2] != latitudes[0]
+    assert logs[0].metadata["converter"]["gnss_noise"] == "2.0"
 
 
 # ----------------------------------------------------------------------------------------------------- folder

@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import chain, posegraph, run
+from fusion.measurements import Estimate, Measurements
 from fusion_io import convert
-from fusion_io.records import PairEstimate, Trajectory
+from fusion_io.records import Trajectory
 from fusion_io.trajectory_files import read_tum
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -180,10 +181,10 @@ def _unsolvable(*_: object) -> None:
     raise RuntimeError("Indeterminant linear system\ndetected")
 
 
-def _diverged(steps: Sequence[PairEstimate], *_: object) -> posegraph.PoseGraphResult:
-    raw = chain.chain(steps)
+def _diverged(known: Measurements, _: object) -> Estimate:
+    raw = chain.chain(known.steps)
     poses = RigidTransform.from_translation(np.full((len(raw), 3), np.nan))
-    return posegraph.PoseGraphResult(Trajectory(raw.stamps_ns, poses, raw.covariances), "")
+    return Estimate(Trajectory(raw.stamps_ns, poses, raw.covariances), "")
 
 
 @pytest.mark.parametrize(

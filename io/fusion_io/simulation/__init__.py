@@ -95,6 +95,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of IMU samples that are lost, singly; with any there is also a burst every ten seconds (default 0)",
     )
     parser.add_argument("--write-mounting", action="store_true", help="tell the IMU's mounting in /tf_static")
+    receiver = parser.add_argument_group("satellite positions, of an antenna above and behind the camera")
+    receiver.add_argument("--gnss", type=_positive, metavar="SECONDS", help="a fix every so often (default: none)")
+    receiver.add_argument(
+        "--gnss-noise", type=_positive, default=1.0, metavar="M", help="standard deviation per axis (default 1)"
+    )
+    receiver.add_argument(
+        "--gnss-outliers",
+        type=_share,
+        default=0.0,
+        metavar="SHARE",
+        help="of fixes that are 50 m off, as by reflected signals (default 0)",
+    )
     given = parser.add_argument_group("along a given trajectory")
     given.add_argument("--poses", type=Path, metavar="FILE", help="poses of the camera, in KITTI's or TUM's format")
     given.add_argument("--times", type=Path, metavar="FILE", help="stamps of KITTI's poses, seconds, one a line")
@@ -118,6 +130,7 @@ def run(args: argparse.Namespace) -> int:
 def _simulate(args: argparse.Namespace) -> Recording:
     from scipy.spatial.transform import Rotation
 
+    from fusion_io.gnss import Receiver
     from fusion_io.simulation import logs
     from fusion_io.simulation.motion import ROTATION_IMU_CAMERA_KITTI, ImuModel
     from fusion_io.simulation.photometry import REAL_CAMERA, ImageModel
@@ -127,6 +140,7 @@ def _simulate(args: argparse.Namespace) -> Recording:
     roll, pitch, yaw = args.imu_mounting_deg
     turn = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)  # of the IMU: vectors turn the other way
     mounting = turn.inv() * ROTATION_IMU_CAMERA_KITTI
+    receiver = None if args.gnss is None else Receiver(args.gnss, args.gnss_noise, args.seed, args.gnss_outliers)
     setup = logs.Setup(
         seed=args.seed,
         width=args.size[0],
@@ -139,6 +153,7 @@ def _simulate(args: argparse.Namespace) -> Recording:
         imu_rate_hz=args.imu_rate,
         imu=ImuModel(rotation_imu_camera=mounting, time_offset_s=1e-3 * args.imu_offset_ms),
         imu_dropout=args.imu_dropout,
+        gnss=receiver,
     )
     if args.poses is None:
         recording = logs.simulate_drive(

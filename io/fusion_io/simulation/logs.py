@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io import kitti, trajectory_files
 from fusion_io.errors import LogError
+from fusion_io.gnss import Receiver, fixes_at
 from fusion_io.recording import Recording, between
 from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, FloatArray, ImuSeries, IntArray, Trajectory
 from fusion_io.simulation import traffic
@@ -37,6 +38,8 @@ IMU_MARGIN_S = 0.25  # of IMU samples before the first and after the last frame 
 CAMERA_HEIGHT_M = DriveStyle().camera_height_m
 BURST_EVERY_S = 10.0
 CAR_ATTEMPTS = 10
+ANTENNA_IN_CAMERA = np.array([0.3, -0.5, -1.0])  # m
+ORIGIN = (49.0, 8.4, 115.0)  # of the street, which lies east, north, up about it: degrees, degrees, metres
 
 
 class Carrier(StrEnum):
@@ -53,7 +56,7 @@ class Setup:
 
     depth_sensor: None gives the exact depth. moving_cars: how many are to come near the camera on
     its way. imu_dropout: share of IMU samples that are lost, singly; with any there is also a
-    burst every ten seconds.
+    burst every ten seconds. gnss: what receives satellites, if anything does.
     """
 
     seed: int = 0
@@ -67,6 +70,7 @@ class Setup:
     imu_rate_hz: float = 100.0
     imu: ImuModel = field(default_factory=ImuModel)
     imu_dropout: float = 0.0
+    gnss: Receiver | None = None
 
     def camera(self) -> CameraInfo:
         """The pinhole camera: square pixels, the principal point in the middle."""
@@ -172,6 +176,7 @@ def _recording(
         frame_count=len(stamps),
         imu=imu,
         ground_truth=truth,
+        gnss=[] if setup.gnss is None else setup.gnss.fixes(fixes_at(stamps, poses.apply(ANTENNA_IN_CAMERA), ORIGIN)),
     )
 
 

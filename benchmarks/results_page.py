@@ -1,0 +1,151 @@
+"""The page of results: the table of targets, and for each section its figures, its plot and what is to be said."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from fusion.evaluation import common
+from fusion.plots import GROUND_TRUTH_STYLE, STYLES
+from fusion_io.records import Trajectory
+
+COLUMNS = {"posegraph": "pose graph", "ekf": "EKF"}
+DPI = 72
+PANEL_INCHES = 3.6
+
+
+@dataclass(frozen=True)
+class Check:
+    """A measure of a log: of the raw trajectory (None: it has none), of the back ends, and what it must not exceed.
+
+    bound: one for all, or by back end; a back end without a bound is only reported.
+    """
+
+    log: str
+    measure: str
+    raw: float | None
+    values: Mapping[str, float]
+    bound: float | Mapping[str, float]
+    form: str = "{:.3g}"
+
+    def limit(self, name: str) -> float | None:
+        """The bound of a back end."""
+        return self.bound.get(name) if isinstance(self.bound, Mapping) else self.bound
+
+
+class Table(NamedTuple):
+    """Words in rows."""
+
+    headings: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+class Path2d(NamedTuple):
+    """Trajectories to be seen from above."""
+
+    title: str
+    trajectories: Mapping[str, Trajectory]
+    truth: Trajectory
+
+
+@dataclass(frozen=True)
+class Section:
+    """What was measured on one kind of log; name is that of its plot and of its remarks."""
+
+    name: str
+    title: str
+    checks: Sequence[Check]
+    tables: Sequence[Table] = ()
+    paths: Sequence[Path2d] = field(default_factory=tuple)
+
+
+def write_page(path: Path, sections: Sequence[Section]) -> None:
+    """Write the page, and its plots into the folder of its name beside it."""
+    checks = [check for section in sections for check in section.checks]
+    parts = [INTRODUCTION, _markdown(_targets(checks))]
+    for section in sections:
+        parts += [f"## {section.title}", REMARKS[section.name], *map(_markdown, section.tables)]
+        if section.paths:
+            plot = path.with_suffix("") / f"{section.name}.png"
+            plot.parent.mkdir(parents=True, exist_ok=True)
+            plot_paths(section.paths).savefig(plot, format="png", dpi=DPI)
+            parts.append(f"![{section.title}, from above]({plot.relative_to(path.parent).as_posix()})")
+    path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def plot_paths(paths: Sequence[Path2d]) -> Figure:
+    """Trajectories from above, a panel each."""
+    figure = Figure(figsize=(PANEL_INCHES * len(paths), PANEL_INCHES + 0.6), layout="constrained")
+    panels = figure.subplots(1, len(paths), squeeze=False)[0]
+    for axes, path in zip(panels, paths, strict=True):
+        _, truth = common(path.trajectories["raw"], path.truth)
+        axes.plot(*truth.poses.translation[:, [0, 2]].T, **GROUND_TRUTH_STYLE)
+        for name, trajectory in path.trajectories.items():
+            axes.plot(*trajectory.poses.translation[:, [0, 2]].T, **STYLES[name])
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(path.title)
+        axes.grid(alpha=0.3)
+        axes.set_xlabel("x [m]")
+    panels[0].set_ylabel("z [m]")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def _targets(checks: Sequence[Check]) -> Table:
+    """The measured figures beside the targets."""
+    rows = [
+        (
+            check.log,
+            check.measure,
+            "" if check.raw is None else check.form.format(check.raw),
+            _bound(check),
+            *(_judged(check, name) for name in COLUMNS),
+        )
+        for check in checks
+    ]
+    return Table(("log", "measure", "raw", "at most", *COLUMNS.values()), rows)
+
+
+def _bound(check: Check) -> str:
+    if not isinstance(check.bound, Mapping):
+        return f"{check.bound:.3g}"
+    return ", ".join(f"{COLUMNS[name]} {bound:.3g}" for name, bound in check.bound.items())
+
+
+def _judged(check: Check, name: str) -> str:
+    """A figure and whether it is within its bound."""
+    if name not in check.values:
+        return ""
+    value, limit = check.values[name], check.limit(name)
+    shown = check.form.format(value)
+    if limit is None:
+        return shown
+    return f"{shown} yes" if value <= limit else f"**{shown} no**"
+
+
+def _markdown(table: Table) -> str:
+    lines = [table.headings, tuple("---" for _ in table.headings), *table.rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+INTRODUCTION = """\
+# Results
+
+This page is made by `make results` from the logs; nothing in it is copied by hand. Each target is an upper bound: *yes*
+where it is kept, **no** where it is not. t_rel and r_rel are those of the KITTI devkit, ATE is the root mean square of
+positions after rigid alignment, ANEES is 3 where the stated covariances are right. How they are defined:
+[metrics](explanation/metrics.md)."""
+
+REMARKS = {
+    "published": "",
+    "noise": "",
+    "revisit": "",
+    "rendered": "",
+    "wrong": "",
+    "network": "",
+    "timing": "",
+}

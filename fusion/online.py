@@ -1,0 +1,675 @@
+"""The pose graph as it runs on a robot: at each instant the pose of the latest frame, from what was measured until then.
+
+Two layers (as in Qin et al., "VINS-Mono", 2018). A *fixed-lag smoother* has the variables and factors of
+`fusion.posegraph` for the last seconds; what leaves its window is marginalised into a Gaussian prior on what stays
+(Dong-Si and Mourikis, "Motion tracking with fixed-lag smoothing", 2011), by QR. It knows nothing of loops: its
+trajectory, the odometry, drifts. A *map* of keyframes holds how it drifted there, D = T_world_odometry, with the joint
+covariance of all of them (Roumeliotis and Burdick, "Stochastic cloning", 2002), so that a loop corrects all keyframes,
+and the present through the last of them. A full iSAM2 would have to eliminate the way back to the loop anew.
+
+The pose of frame k depends on measurements until k only, given how the IMU is mounted, what its clock reads and the
+gyro's first bias. Those come from the whole log (`fusion.imu.calibrate`, and refined by `posegraph.solve` where the
+measurements have that): they stand for what a robot knows from its drives before. What else was decided over the whole
+log is not undone either: which stretches of the IMU are faulty, and how holes between pairs are bridged.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, G, S, V, X
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg.blas import dgemm
+from scipy.spatial.transform import RigidTransform
+from scipy.stats import chi2
+
+from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
+from fusion.config import PoseGraphConfig
+from fusion.factors import WorldFactor, by_vector, extrinsics, padded
+from fusion.imu import ImuCalibration
+from fusion.measurements import Estimate, Measurements
+from fusion.pair_model import camera, difference, inverse, predict
+from fusion.posegraph import FIRST_POSE_SIGMA, GRAVITY, INTEGRATION_SIGMA, KNOT_S, REJECTED_WEIGHT, check
+from fusion_io.records import NANOSECONDS, FloatArray, PairEstimate, Trajectory
+
+LAG = 10  # frames behind the latest one that are estimated anew with it
+SETTLING = 20  # frames that all stay at first, until velocity and gravity are known
+ITERATIONS = 3  # while it settles, and where a pair was left out
+GRAVITY_SIGMA = 0.3  # rad, of the first direction: accelerations hide it
+VELOCITY_SIGMA = 30.0  # m/s, of the first one
+REJECTED_IN_A_ROW = 5  # pairs; then it is the prediction that is wrong
+
+KEYFRAME_S = 2.0
+ROOM = 32  # keyframes that the map grows by
+
+
+def solve(measurements: Measurements, config: PoseGraphConfig) -> Estimate:
+    """The pose of every frame at its own instant, with its covariance; measurements as for `posegraph.solve`.
+
+    Steps that skip frames, and positions, are not used. Raises LogError for a pair estimate that is no measurement.
+    """
+    check([*measurements.steps, *measurements.loops])
+    tracker = Tracker(measurements, config)
+    poses, covariances = zip(tracker.present, *(tracker.advance() for _ in measurements.steps), strict=True)
+    stamps = stamps_of(measurements.steps)
+    trajectory = Trajectory(stamps, RigidTransform.from_matrix(np.stack(poses)), np.stack(covariances))
+    return Estimate(trajectory, tracker.note, tracker.rejected, loops_used=tracker.loops_used)
+
+
+class Pose(NamedTuple):
+    """Of the camera: T_world_camera (4, 4) and its covariance (6, 6)."""
+
+    T: FloatArray
+    covariance: FloatArray
+
+
+class Tracker:
+    """Follows a camera frame by frame."""
+
+    def __init__(self, measurements: Measurements, config: PoseGraphConfig) -> None:
+        self._smoother = Smoother(measurements, config)
+        self._map = Map(config.gate_probability)
+        self._stamps = stamps_of(measurements.steps)
+        self._loops = measurements.loops
+        self._arriving: dict[int, list[int]] = defaultdict(list)  # the loops that each frame brings
+        for row, loop in enumerate(self._loops):
+            self._arriving[self._frame(loop.target_stamp_ns)].append(row)
+        self._latest = 0
+        self.loops_used: NDArray[np.bool_] = np.zeros(len(self._loops), dtype=np.bool_)
+        self.present = Pose(np.eye(4), np.zeros((6, 6)))
+
+    def advance(self) -> Pose:
+        """The next frame."""
+        self._latest += 1
+        keyframe = self._map.last
+        odometry = self._smoother.advance(keyframe)
+        self.present = self._map.move_to(odometry)
+        for row in self._arriving[self._latest]:
+            loop = self._loops[row]
+            closed = self._map.close(self._frame(loop.source_stamp_ns), loop)
+            if closed is not None:
+                self.present, self.loops_used[row] = closed, True
+        if self._stamps[self._latest] - self._stamps[keyframe] >= KEYFRAME_S * NANOSECONDS:
+            self._map.keep()
+        return self.present
+
+    @property
+    def rejected(self) -> int:
+        """Measurements that were left out as outliers."""
+        return self._smoother.rejected + int(np.sum(~self.loops_used))
+
+    @property
+    def note(self) -> str:
+        """One line on how the measurements were used."""
+        measured, steps = self._smoother.inertial_steps, len(self._stamps) - 1
+        imu = f"IMU on {measured} of {steps} steps" if measured else "pairs only"
+        return imu + (f"; loops used: {self.loops_used.sum()} of {len(self._loops)}" if self._loops else "")
+
+    def _frame(self, stamp_ns: int) -> int:
+        return int(np.searchsorted(self._stamps, stamp_ns))
+
+
+# ------------------------------------------------------------------------------------------- the fixed-lag smoother
+
+
+class Odometry(NamedTuple):
+    """The latest pose T (4, 4) of the camera without loops, and the joint covariance (12, 12) of keyframe and it."""
+
+    T: FloatArray
+    joint: FloatArray
+
+
+class _Inertial(NamedTuple):
+    """What the IMU measured during a step."""
+
+    window: ImuWindow
+    preintegrated: gtsam.PreintegratedImuMeasurements
+
+
+@dataclass(slots=True)
+class _Pair:
+    """A pair estimate in the window, with the twists (2, 6) of the IMU at its ends."""
+
+    step: int
+    knot: int
+    whitener: FloatArray
+    twists: FloatArray
+    weight: float = 1.0
+
+
+class Smoother:
+    """The latest pose relative to the first camera, from pairs and the IMU."""
+
+    def __init__(self, measurements: Measurements, config: PoseGraphConfig) -> None:
+        self._config = config
+        self._steps = measurements.steps
+        self._seconds = (stamps_of(self._steps) - self._steps[0].source_stamp_ns) / NANOSECONDS
+        motions = motions_of(self._steps)
+        self._motions = np.asarray(motions.as_matrix())
+        rates = np.hstack([motions.rotation.as_rotvec(), motions.translation]) / np.diff(self._seconds)[:, None]
+        self._calibration = measurements.calibration if measurements.imu is not None else None
+        self._samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
+        self._gate = float(chi2.isf(config.gate_probability, 6))
+        self._T_camera_imu = np.eye(4)
+        if self._calibration is not None:
+            self._T_camera_imu[:3, :3] = self._calibration.mounting.inv().as_matrix()
+        self._mounting = measurements.mounting
+        if self._mounting is not None:
+            self._T_camera_imu = self._mounting.T_camera_imu
+        self._by_pairs = (rates.reshape(-1, 2, 3) @ self._T_camera_imu[:3, :3]).reshape(-1, 6)  # twists, IMU axes
+
+        self._latest = 0
+        self._values = gtsam.Values()
+        self._factors: list[gtsam.NonlinearFactor] = []
+        self._world: WorldFactor | None = None
+        self._pairs: dict[int, _Pair] = {}
+        self._evaluated: dict[int, tuple[FloatArray, list[FloatArray]]] = {}  # errors and Jacobians of the pairs
+        self._point, self._linear, self._step = gtsam.Values(), gtsam.GaussianFactorGraph(), gtsam.VectorValues()
+        self._knots = [0]  # of every frame
+        self._begins = [0]  # the first frame of every knot
+        self._twist = np.zeros(6)
+        self._in_a_row = 0
+        self.inertial_steps = self.rejected = 0
+
+    def advance(self, keyframe: int) -> Odometry:
+        """The next frame."""
+        step = self._latest
+        self._latest += 1
+        inertial = self._measured(step)
+        if step == 0:
+            self._begin(inertial)
+        imu_wrong, pair_wrong = self._judge(step, inertial) if inertial else (False, False)
+        if imu_wrong:
+            inertial = None
+        self._predict(step)
+        self._add_knot()
+        self._add_inertial(step, inertial)
+        self._add_pair(step, inertial, REJECTED_WEIGHT if pair_wrong else 1.0)
+
+        before = self._values
+        R = self._iterate(keyframe, ITERATIONS if pair_wrong or self._latest <= SETTLING else 1)
+        if self._contradicted(step):
+            self._pairs[step].weight = REJECTED_WEIGHT
+            self._values = before
+            R = self._iterate(keyframe, ITERATIONS)
+        rejected = self._pairs[step].weight < 1.0
+        self._in_a_row = self._in_a_row + 1 if rejected else 0
+        self.rejected += int(rejected) + int(imu_wrong)
+        odometry = self._odometry(R, keyframe)
+        if self._latest >= SETTLING:
+            self._marginalise(keyframe)
+        return odometry
+
+    # --- What a frame brings ---
+
+    def _measured(self, step: int) -> _Inertial | None:
+        """What the IMU measured during a step."""
+        if self._samples is None or self._calibration is None:
+            return None
+        ends = self._steps[step]
+        window = self._samples.over(ends.source_stamp_ns, ends.target_stamp_ns)
+        if window is None:
+            return None
+        knot = self._knots[step]
+        bias = self._values.atConstantBias(B(knot)) if step else _first_bias(self._calibration)
+        return _Inertial(window, preintegrate(window, bias, self._config))
+
+    def _judge(self, step: int, measured: _Inertial) -> tuple[bool, bool]:
+        """Whether the IMU, and whether the pair, is wrong: where they contradict each other, who leaves the last rate.
+
+        Motion is smooth: of two rotations that differ by more than noise, the one further from the rate before is
+        wrong.
+        """
+        seconds = self._seconds[step + 1] - self._seconds[step]
+        by_pair = self._by_pairs[step, :3]
+        by_gyro = gtsam.Rot3.Logmap(measured.preintegrated.deltaRij()) / seconds
+        of_pair = np.trace(self._steps[step].covariance[:3, :3]) / 3 / seconds**2
+        variance = of_pair + self._config.pair_rate_bias_sigma**2
+        if np.sum((by_pair - by_gyro) ** 2) <= self._gate * variance:
+            return False, False
+        gyro_away, pair_away = (np.linalg.norm(rate - self._twist[:3]) for rate in (by_gyro, by_pair))
+        return bool(gyro_away > pair_away), bool(gyro_away <= pair_away)
+
+    def _begin(self, inertial: _Inertial | None) -> None:
+        """The variables of the first frame, and what is known of them."""
+        config, calibration = self._config, self._calibration
+        self._values.insert(X(0), gtsam.Pose3(self._T_camera_imu))
+        self._values.insert(S(0), np.zeros(4))
+        front_end = np.repeat([config.scale_sigma(self._steps[:1]), config.pair_rate_bias_sigma], [1, 3])
+        self._factors.append(gtsam.PriorFactorVector(S(0), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(front_end)))
+        if calibration is None:
+            fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
+            self._factors.append(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
+            return
+        self._twist = self._twist_by(0, inertial, 0)
+        velocity = self._T_camera_imu[:3, :3] @ self._twist[3:]
+        bias = _first_bias(calibration)
+        bias_sigmas = [config.accelerometer_bias_sigma, np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)]
+        self._values.insert(V(0), velocity)
+        self._values.insert(B(0), bias)
+        strayed, covariance = self._mounting_prior(calibration)
+        self._values.insert(E(0), strayed)
+        self._factors += [
+            gtsam.PriorFactorVector(V(0), velocity, gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)),
+            gtsam.PriorFactorConstantBias(B(0), bias, gtsam.noiseModel.Diagonal.Sigmas(np.repeat(bias_sigmas, 3))),
+            gtsam.PriorFactorVector(E(0), strayed, gtsam.noiseModel.Gaussian.Covariance(covariance)),
+        ]
+        self._world = WorldFactor(self._T_camera_imu, self._twist[None], FIRST_POSE_SIGMA)
+        self._factors.append(_factor_of(self._world))
+
+    def _mounting_prior(self, calibration: ImuCalibration) -> tuple[FloatArray, FloatArray]:
+        """E(0) (10,) and its covariance: as a back end has refined it, as the calibration found it, or as given."""
+        if (refined := self._mounting) is not None:
+            return np.concatenate([np.zeros(6), [refined.ahead_s], refined.misalignment]), refined.covariance
+        config, R = self._config, self._T_camera_imu[:3, :3]
+        given = not np.any(calibration.rotation_std_rad)
+        rotation_std = np.full(3, config.given_mounting_sigma) if given else calibration.rotation_std_rad
+        offset_std = calibration.time_offset_std_s or config.given_time_offset_sigma
+        others = np.repeat([config.lever_arm_sigma, offset_std, config.pair_misalignment_sigma], [3, 1, 3])
+        covariance = block_diag(R.T @ np.diag(rotation_std**2) @ R, np.diag(others**2))
+        return np.zeros(10), np.asarray(covariance)
+
+    def _twist_by(self, step: int, inertial: _Inertial | None, piece: int) -> FloatArray:
+        """The twist (6,) of the IMU at an end of a step, where its first or last piece is; without one its mean."""
+        twist = self._by_pairs[step].copy()
+        if inertial is not None:
+            twist[:3] = inertial.window.angular_velocity[piece]
+        return twist
+
+    def _predict(self, step: int) -> None:
+        """The variables of a frame where the pair takes them."""
+        F = self._T_camera_imu
+        pose = self._values.atPose3(X(step)).matrix() @ inverse(F) @ self._motions[step] @ F
+        self._values.insert(X(step + 1), gtsam.Pose3(pose))
+        if self._calibration is not None:
+            seconds = self._seconds[step + 1] - self._seconds[step]
+            moved = pose[:3, 3] - self._values.atPose3(X(step)).translation()
+            self._values.insert(V(step + 1), moved / seconds)
+
+    def _add_knot(self) -> None:
+        """The states that are one a second, from those a second before."""
+        seconds, knot = self._seconds, self._knots[-1]
+        if seconds[self._latest] // KNOT_S == seconds[self._latest - 1] // KNOT_S:
+            self._knots.append(knot)
+            return
+        config = self._config
+        dt = seconds[self._latest] - seconds[self._begins[knot]]
+        self._knots.append(knot + 1)
+        self._begins.append(self._latest)
+        self._values.insert(S(knot + 1), self._values.atVector(S(knot)))
+        self._factors.append(front_end_walk(knot, dt, config.scale_sigma(self._steps[:1]), config))
+        if self._calibration is not None:
+            self._values.insert(B(knot + 1), self._values.atConstantBias(B(knot)))
+            walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3) * np.sqrt(dt)
+            noise = gtsam.noiseModel.Diagonal.Sigmas(walk)
+            same = gtsam.imuBias.ConstantBias()
+            self._factors.append(gtsam.BetweenFactorConstantBias(B(knot), B(knot + 1), same, noise))
+
+    def _add_inertial(self, step: int, inertial: _Inertial | None) -> None:
+        """The factor between two frames that the IMU measured; over others the velocity walks."""
+        if self._calibration is None:
+            return
+        if inertial is None:
+            sigma = self._config.unknown_acceleration * np.sqrt(self._seconds[step + 1] - self._seconds[step])
+            walk = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            self._factors.append(gtsam.BetweenFactorVector(V(step), V(step + 1), np.zeros(3), walk))
+            return
+        if not self._values.exists(G(0)):
+            shown = inertial.window.durations @ inertial.window.linear_acceleration
+            down = gtsam.Unit3(-self._values.atPose3(X(step)).rotation().matrix() @ shown)
+            self._values.insert(G(0), down)
+            about = gtsam.noiseModel.Isotropic.Sigma(2, GRAVITY_SIGMA)
+            self._factors.append(gtsam.PriorFactorUnit3(G(0), down, about))
+        keys = X(step), V(step), X(step + 1), V(step + 1), B(self._knots[step]), G(0)
+        self._factors.append(gtsam.ImuFactorWithGravityDirection(*keys, inertial.preintegrated, GRAVITY))
+        self.inertial_steps += 1
+
+    def _add_pair(self, step: int, inertial: _Inertial | None, weight: float) -> None:
+        twists = np.zeros((2, 6))
+        if self._calibration is not None:
+            twist = self._twist_by(step, inertial, -1)
+            twists, self._twist = np.stack([self._twist, twist]), twist
+        whitener = np.linalg.inv(np.linalg.cholesky(self._steps[step].covariance))
+        self._pairs[step] = _Pair(step, self._knots[step], whitener, twists, weight)
+        keys = self._keys_of(self._pairs[step])
+        self._factors.append(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, self._lookup(step)))
+
+    def _keys_of(self, pair: _Pair) -> list[int]:
+        mounted = [] if self._calibration is None else [E(0)]
+        return [X(pair.step), X(pair.step + 1), *mounted, S(pair.knot)]
+
+    def _lookup(self, step: int) -> Callable[..., FloatArray]:
+        def look_up(_: gtsam.CustomFactor, __: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+            error, by_each = self._evaluated[step]
+            root = np.sqrt(self._pairs[step].weight)
+            if jacobians is not None:
+                for place, jacobian in enumerate(by_each):
+                    jacobians[place] = root * jacobian
+            return np.asarray(root * error)
+
+        return look_up
+
+    # --- The window ---
+
+    def _evaluate(self) -> None:
+        """All pairs in the window, and the tie to the first camera, at the present values."""
+        values, pairs = self._values, list(self._pairs.values())
+        if self._world is not None:
+            self._world.update(values)
+        source, target = (
+            np.stack([values.atPose3(X(pair.step + after)).matrix() for pair in pairs]) for after in (0, 1)
+        )
+        inertial = self._calibration is not None
+        strayed = values.atVector(E(0)) if inertial else np.zeros(10)
+        steps = [pair.step for pair in pairs]
+        twists = np.stack([pair.twists for pair in pairs], axis=1)
+        shown = predict(
+            source,
+            target,
+            extrinsics(self._T_camera_imu, strayed),
+            (twists[0], twists[1]),
+            strayed[6],
+            strayed[7:],
+            np.stack([values.atVector(S(pair.knot)) for pair in pairs]),
+            self._seconds[1:][steps] - self._seconds[steps],
+        )
+        whiteners = np.stack([pair.whitener for pair in pairs])
+        errors = -np.einsum("nij,nj->ni", whiteners, difference(shown.motion, self._motions[steps]))
+        jacobians = [shown.by_source, shown.by_target, shown.by_front_end]
+        if inertial:
+            by_mounting = np.concatenate([shown.by_extrinsics @ by_vector(strayed), shown.by_misalignment], axis=2)
+            jacobians.insert(2, by_mounting)
+        whitened = [whiteners @ each for each in jacobians]
+        self._evaluated = {pair.step: (errors[row], [each[row] for each in whitened]) for row, pair in enumerate(pairs)}
+
+    def _iterate(self, keyframe: int, times: int) -> FloatArray:
+        """Gauss-Newton steps from the present values; returns R (M, M) of the last one, what is wanted at its end."""
+        order = self._order(keyframe)
+        for _ in range(times):
+            self._evaluate()
+            self._point = self._values
+            self._linear = self._graph().linearize(self._point)
+            A, b = self._linear.jacobian(order)
+            R = np.linalg.qr(np.column_stack([A, b]), mode="r")[: A.shape[1]]
+            step = solve_triangular(R[:, :-1], R[:, -1])
+            if not np.all(np.isfinite(step)):
+                raise RuntimeError(f"the step at frame {self._latest} is not finite")
+            self._step = _by_key(step, order)
+            self._values = self._point.retract(self._step)
+        return np.asarray(R[:, :-1])
+
+    def _graph(self) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self._factors:
+            graph.push_back(factor)
+        return graph
+
+    def _order(self, keyframe: int) -> gtsam.Ordering:
+        """Along time; what all frames share, the keyframe and the latest frame come last."""
+        last = [key for key in (G(0), *self._wanted(keyframe)) if self._values.exists(key)]
+        return _ordering([*sorted(set(self._values.keys()) - set(last), key=self._age), *last])
+
+    def _wanted(self, keyframe: int) -> list[int]:
+        """The keyframe and the latest frame, with what they are mounted by."""
+        return [X(keyframe), X(self._latest), *([] if self._calibration is None else [E(0)])]
+
+    def _age(self, key: int) -> tuple[int, int]:
+        """Where a variable of a frame or a knot stands in time."""
+        symbol = gtsam.Symbol(key)
+        of_knot = chr(symbol.chr()) in "bs"
+        return (self._begins[symbol.index()] if of_knot else symbol.index()), key
+
+    def _contradicted(self, step: int) -> bool:
+        """Whether the latest pair is an outlier beside all else."""
+        pair = self._pairs[step]
+        if self._config.robust == "none" or pair.weight < 1.0 or self._in_a_row >= REJECTED_IN_A_ROW:
+            return False
+        error, jacobians = self._evaluated[step]
+        error = error + sum(J @ self._step.at(key) for J, key in zip(jacobians, self._keys_of(pair), strict=True))
+        return float(error @ error) > self._gate
+
+    def _odometry(self, R: FloatArray, keyframe: int) -> Odometry:
+        width = 12 if self._calibration is None else 22
+        root = solve_triangular(R[-width:, -width:], np.eye(width))
+        poses = np.stack([self._values.atPose3(X(frame)).matrix() for frame in (keyframe, self._latest)])
+        if self._calibration is None:
+            return Odometry(poses[1], root @ root.T)
+        strayed = self._values.atVector(E(0))
+        twists = np.stack([self._twist, self._twist])
+        mounted = extrinsics(self._T_camera_imu, strayed)
+        cameras, by_pose, by_extrinsics = camera(poses, mounted, twists, float(strayed[6]))
+        by_mounting = padded(by_extrinsics @ by_vector(strayed))
+        root = np.hstack([block_diag(by_pose[0], by_pose[1]), np.vstack(list(by_mounting))]) @ root
+        return Odometry(cameras[1], root @ root.T)
+
+    def _marginalise(self, keyframe: int) -> None:
+        """What is behind the window becomes a prior on what stays, linear about where the last step began."""
+        oldest = self._latest - LAG
+        stay = X(keyframe), G(0), E(0)
+        leaving = {
+            key
+            for key in self._values.keys()
+            if key not in stay and self._age(key)[0] < self._first_of_knot(key, oldest)
+        }
+        if not leaving:
+            return
+        touched = [not leaving.isdisjoint(factor.keys()) for factor in self._factors]
+        graph = gtsam.GaussianFactorGraph()
+        for row in np.flatnonzero(touched).tolist():
+            graph.push_back(self._linear.at(row))
+        order = _ordering(sorted(leaving, key=self._age))
+        _, prior = graph.eliminatePartialSequential(order, gtsam.EliminateQR)
+        self._factors = [factor for factor, gone in zip(self._factors, touched, strict=True) if not gone]
+        self._factors += [gtsam.LinearContainerFactor(prior.at(i), self._point) for i in range(prior.size())]
+        for key in leaving:
+            self._values.erase(key)
+        self._pairs = {step: pair for step, pair in self._pairs.items() if leaving.isdisjoint(self._keys_of(pair))}
+        if X(0) in leaving:
+            self._world = None
+
+    def _first_of_knot(self, key: int, oldest: int) -> int:
+        """The first frame that needs a variable like this one while `oldest` is in the window."""
+        return self._begins[self._knots[oldest]] if chr(gtsam.Symbol(key).chr()) in "bs" else oldest
+
+
+def front_end_walk(knot: int, dt: float, scale_sigma: float, config: PoseGraphConfig) -> gtsam.NonlinearFactor:
+    """From one state of the front end to the next after dt seconds: a Gauss-Markov process."""
+    sigma = np.repeat([scale_sigma, config.pair_rate_bias_sigma], [1, 3])
+    keep = np.exp(-dt / np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3]))
+    whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
+    unit = gtsam.noiseModel.Unit.Create(4)
+    linear = gtsam.JacobianFactor(S(knot), -whitener * keep, S(knot + 1), whitener, np.zeros(4), unit)
+    point = gtsam.Values()
+    point.insert(S(knot), np.zeros(4))
+    point.insert(S(knot + 1), np.zeros(4))
+    return gtsam.LinearContainerFactor(linear, point)
+
+
+def preintegrate(
+    window: ImuWindow, bias: gtsam.imuBias.ConstantBias, config: PoseGraphConfig
+) -> gtsam.PreintegratedImuMeasurements:
+    """What the IMU measured during a step; gravity is a variable of the graph."""
+    parameters = gtsam.PreintegrationParams(np.zeros(3))
+    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
+    parameters.setAccelerometerCovariance(config.accelerometer_noise**2 * np.eye(3))
+    parameters.setIntegrationCovariance(INTEGRATION_SIGMA**2 * np.eye(3))
+    preintegrated = gtsam.PreintegratedImuMeasurements(parameters, bias)
+    for duration, rate, acceleration in zip(*window, strict=True):
+        preintegrated.integrateMeasurement(acceleration, rate, duration)
+    return preintegrated
+
+
+def _factor_of(batch: WorldFactor) -> gtsam.NonlinearFactor:
+    """The only factor of a batch."""
+    graph = gtsam.NonlinearFactorGraph()
+    batch.add_to(graph)
+    return graph.at(0)
+
+
+def _first_bias(calibration: ImuCalibration) -> gtsam.imuBias.ConstantBias:
+    return gtsam.imuBias.ConstantBias(np.zeros(3), calibration.gyro_bias)
+
+
+def _by_key(step: FloatArray, order: gtsam.Ordering) -> gtsam.VectorValues:
+    """A step over all variables in order, split."""
+    widths = {"x": 6, "v": 3, "b": 6, "s": 4, "g": 2, "e": 10}
+    split, start = gtsam.VectorValues(), 0
+    for place in range(order.size()):
+        key = order.at(place)
+        end = start + widths[chr(gtsam.Symbol(key).chr())]
+        split.insert(key, step[start:end])
+        start = end
+    return split
+
+
+def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
+    order = gtsam.Ordering()
+    for key in keys:
+        order.push_back(key)
+    return order
+
+
+# ----------------------------------------------------------------------------------------------------------- the map
+
+
+class _Place(NamedTuple):
+    """A frame in the odometry, and how its drift follows from that of the keyframe before it.
+
+    xi = slope xi_keyframe + noise of covariance own, perturbing T (4, 4) on the left.
+    """
+
+    keyframe: int
+    T: FloatArray
+    slope: FloatArray
+    own: FloatArray
+
+
+class _Drifted(NamedTuple):
+    """A frame in the world: T (4, 4), and the errors on its left: slope times those of the keyframe, and its own."""
+
+    keyframe: int
+    T: FloatArray
+    slope: FloatArray
+    own: FloatArray
+
+
+class Map:
+    """How the odometry has drifted at the keyframes, all of them with their joint covariance.
+
+    The errors xi of a pose in the world, Exp(xi) D T, are on its left, where those of a drift in common are the same. A
+    loop of motion Z from frame i to frame k shows of them
+
+        Ad(X_k) Log((X_i^-1 X_k)^-1 Z) = xi_k - xi_i + noise                                                         (1)
+
+    The drift at a frame follows from that at the keyframe before it by their joint covariance in the odometry, which
+    makes the keyframes a Markov chain: that with the odometry's own covariance at every frame.
+    """
+
+    def __init__(self, gate_probability: float) -> None:
+        self._gate = float(chi2.isf(gate_probability, 6))
+        origin = _Place(0, np.eye(4), np.eye(6), np.zeros((6, 6)))
+        self._places = [origin]
+        self._keyframes = [0]  # their frames
+        self._odometry_covariances = [np.zeros((6, 6))]
+        self._drifts = np.tile(np.eye(4), (ROOM, 1, 1))
+        self._covariance = np.zeros((6 * ROOM, 6 * ROOM), order="F")
+        self._latest_covariance = np.zeros((6, 6))
+
+    @property
+    def last(self) -> int:
+        """The frame of the last keyframe."""
+        return self._keyframes[-1]
+
+    def move_to(self, odometry: Odometry) -> Pose:
+        """The next frame."""
+        number = len(self._keyframes) - 1
+        covariance = self._odometry_covariances[number]
+        crossed, self._latest_covariance = odometry.joint[6:, :6], odometry.joint[6:, 6:]
+        by_keyframe = crossed @ np.linalg.pinv(covariance, hermitian=True)
+        own = self._latest_covariance - by_keyframe @ crossed.T
+        left, back = _adjoint(odometry.T), _adjoint(inverse(self._places[self.last].T))
+        self._places.append(_Place(number, odometry.T, left @ by_keyframe @ back, left @ own @ left.T))
+        there = self._at(len(self._places) - 1)
+        return _seen(there.T, self._between(there, there) + there.own)
+
+    def keep(self) -> None:
+        """Make the latest frame a keyframe."""
+        there = self._at(len(self._places) - 1)
+        number = len(self._keyframes)
+        if number == len(self._drifts):
+            self._drifts = np.concatenate([self._drifts, np.tile(np.eye(4), (ROOM, 1, 1))])
+            self._covariance = np.asfortranarray(np.pad(self._covariance, (0, 6 * ROOM)))
+        here = slice(6 * number, 6 * number + 6)
+        self._covariance[here] = there.slope @ self._rows(there.keyframe)
+        self._covariance[:, here] = self._covariance[here].T
+        self._covariance[here, here] = self._between(there, there) + there.own
+        self._drifts[number] = there.T @ inverse(self._places[-1].T)
+        self._keyframes.append(len(self._places) - 1)
+        self._odometry_covariances.append(self._latest_covariance)
+        self._places[-1] = _Place(number, self._places[-1].T, np.eye(6), np.zeros((6, 6)))
+
+    def close(self, source: int, loop: PairEstimate) -> Pose | None:
+        """The latest pose after a loop from a frame to it; None where the loop is an outlier, and nothing changes."""
+        i, k = self._at(source), self._at(len(self._places) - 1)
+        to_world = _adjoint(k.T)
+        measured = np.asarray(loop.T_source_target.as_matrix())
+        shown = inverse(i.T) @ k.T
+        beyond = to_world @ _log(inverse(shown) @ measured)
+        rows = k.slope @ self._rows(k.keyframe) - i.slope @ self._rows(i.keyframe)
+        of_latest = self._between(k, k) + k.own
+        with_latest = of_latest - self._between(k, i)
+        spread = with_latest - self._between(i, k) + self._between(i, i) + i.own
+        spread += to_world @ loop.covariance @ to_world.T
+        if beyond @ np.linalg.solve(spread, beyond) > self._gate:
+            return None
+        gains = np.linalg.solve(spread, rows)
+        dgemm(-1.0, rows, gains, beta=1.0, c=self._covariance, trans_a=True, overwrite_c=True)
+        moved = RigidTransform.from_exp_coords((beyond @ gains).reshape(-1, 6))
+        self._drifts = np.asarray(moved.as_matrix()) @ self._drifts
+        gain = np.linalg.solve(spread, with_latest.T).T
+        T = _exp(gain @ beyond) @ k.T
+        return _seen(T, of_latest - gain @ with_latest.T)
+
+    def _at(self, frame: int) -> _Drifted:
+        """A frame where it is in the world as far as is known."""
+        number, T, slope, own = self._places[frame]
+        drift = self._drifts[number]
+        here = _exp(slope @ _log(drift))
+        turned = _adjoint(here)
+        return _Drifted(number, here @ T, turned @ slope @ _adjoint(inverse(drift)), turned @ own @ turned.T)
+
+    def _rows(self, number: int) -> FloatArray:
+        """The covariances (6, 6 N) of a keyframe with all keyframes."""
+        return self._covariance[6 * number : 6 * number + 6]
+
+    def _between(self, one: _Drifted, other: _Drifted) -> FloatArray:
+        """The covariance (6, 6) of what two frames have from their keyframes."""
+        columns = slice(6 * other.keyframe, 6 * other.keyframe + 6)
+        return np.asarray(one.slope @ self._rows(one.keyframe)[:, columns] @ other.slope.T)
+
+
+def _log(T: FloatArray) -> FloatArray:
+    """The twist (6,) of a rigid transform."""
+    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T)))
+
+
+def _exp(twist: FloatArray) -> FloatArray:
+    """The rigid transform (4, 4) of a twist."""
+    return np.asarray(gtsam.Pose3.Expmap(twist).matrix())
+
+
+def _adjoint(T: FloatArray) -> FloatArray:
+    return np.asarray(gtsam.Pose3(T).AdjointMap())
+
+
+def _seen(T: FloatArray, on_the_left: FloatArray) -> Pose:
+    """A pose with the covariance of its errors on the right."""
+    to_camera = _adjoint(inverse(T))
+    covariance = to_camera @ on_the_left @ to_camera.T
+    return Pose(T, (covariance + covariance.T) / 2)

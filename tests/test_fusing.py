@@ -1,0 +1,135 @@
+"""What run, replay and API share: what the back ends get, and that the failure of one does not end the other."""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from benchmarks.drives import EKF, POSE_GRAPH, simulate
+from fusion import ekf, fusing, posegraph
+from fusion.config import RunConfig
+from fusion.measurements import Measurements
+from fusion_io.errors import LogError
+from fusion_io.findings import Findings
+from fusion_io.records import NANOSECONDS
+
+DRIVE = simulate(0, 6.0)
+KNOWN = DRIVE.measurements
+CONFIG = RunConfig(posegraph=POSE_GRAPH, ekf=EKF)
+
+
+def _config(backend: Literal["posegraph", "ekf", "both"]) -> RunConfig:
+    return CONFIG.model_copy(update={"backend": backend})
+
+
+@pytest.mark.parametrize(
+    ("backend", "names"), [("both", ["posegraph", "ekf"]), ("posegraph", ["posegraph"]), ("ekf", ["ekf"])]
+)
+def test_only_the_back_ends_that_are_asked_for_give_an_estimate(
+    backend: Literal["posegraph", "ekf", "both"], names: list[str]
+) -> None:
+    findings = Findings()
+    estimates = fusing.fuse(KNOWN, _config(backend), findings)
+    assert list(estimates) == names == list(fusing.back_ends(_config(backend)))
+    assert findings.counts == {}
+    for estimate in estimates.values():
+        assert_array_equal(estimate.trajectory.stamps_ns, DRIVE.truth.stamps_ns)
+
+
+@pytest.mark.parametrize("backend", ["both", "ekf"])
+def test_the_filter_begins_with_the_mounting_of_the_pose_graph(
+    backend: Literal["ekf", "both"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether the pose graph is asked for or not."""
+    given: list[Measurements] = []
+    solve = ekf.solve
+    monkeypatch.setattr(ekf, "solve", lambda known, config: given.append(known) or solve(known, config))
+    fusing.fuse(KNOWN, _config(backend), Findings())
+    expected = posegraph.solve(KNOWN, POSE_GRAPH).mounting
+    assert expected is not None
+    assert given[0].mounting is not None
+    assert_allclose(given[0].mounting.T_camera_imu, expected.T_camera_imu)
+    assert_allclose(given[0].mounting.covariance, expected.covariance)
+
+
+def test_the_filter_uses_no_imu_that_the_pose_graph_had_to_leave_out() -> None:
+    imu = KNOWN.imu
+    assert imu is not None
+    early = imu.stamps_ns < NANOSECONDS
+    short = replace(
+        imu,
+        stamps_ns=imu.stamps_ns[early],
+        angular_velocity=imu.angular_velocity[early],
+        linear_acceleration=imu.linear_acceleration[early],
+    )
+    estimates = fusing.fuse(replace(KNOWN, imu=short), CONFIG, Findings())
+    assert estimates["posegraph"].note.startswith("pairs only: the IMU measured")
+    assert estimates["ekf"].note == "predicted by constant velocity: no IMU"
+
+
+@pytest.mark.parametrize("broken", ["posegraph", "ekf"])
+@pytest.mark.parametrize(
+    "error", [RuntimeError("Indeterminant\nlinear system"), np.linalg.LinAlgError("singular"), LogError("no pair")]
+)
+def test_a_back_end_that_fails_is_counted_and_the_other_is_kept(
+    broken: str, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr({"posegraph": posegraph, "ekf": ekf}[broken], "solve", fail)
+    findings = Findings()
+    estimates = fusing.fuse(Measurements(KNOWN.steps), CONFIG, findings)
+    assert list(estimates) == [name for name in ("posegraph", "ekf") if name != broken]
+    assert findings.counts == {f"{broken}_failed": 1}
+    assert findings.notes == [f"back end failed ({broken}): {' '.join(str(error).split())}"]
+
+
+def test_a_mistake_in_a_back_end_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what bad data can cause is caught."""
+
+    def fail(*_: object) -> None:
+        raise TypeError("a bug")
+
+    monkeypatch.setattr(ekf, "solve", fail)
+    with pytest.raises(TypeError):
+        fusing.fuse(Measurements(KNOWN.steps), CONFIG, Findings())
+
+
+def test_outliers_are_counted_by_back_end() -> None:
+    pairs = list(KNOWN.steps)
+    pairs[30] = replace(pairs[30], translation=pairs[30].translation + [3.0, 0.0, 0.0])
+    findings = Findings()
+    fusing.fuse(replace(KNOWN, steps=pairs), CONFIG, findings)
+    assert findings.counts == {"posegraph_rejected": 1, "ekf_rejected": 1}
+
+
+def test_an_imu_that_is_used_comes_on_the_cameras_clock_without_its_faulty_stretches() -> None:
+    imu, calibration = KNOWN.imu, KNOWN.calibration
+    assert imu is not None
+    assert calibration is not None
+    faulty_ns = np.array([[2 * NANOSECONDS, 3 * NANOSECONDS]])
+    known = replace(calibration, time_offset_s=0.05, faulty_ns=faulty_ns)
+    findings = Findings()
+    found = fusing.measurements(KNOWN.steps, imu, known, DRIVE.truth.stamps_ns, findings)
+    assert found.steps == list(KNOWN.steps)
+    assert found.calibration is known
+    assert found.imu is not None
+    own_clock = found.imu.stamps_ns + round(0.05 * NANOSECONDS)
+    assert_array_equal(own_clock, imu.stamps_ns[(imu.stamps_ns < faulty_ns[0, 0]) | (imu.stamps_ns > faulty_ns[0, 1])])
+    assert findings.counts == {"imu_faulty_stretches": 1}
+
+
+def test_an_imu_that_is_not_used_does_not_reach_the_back_ends_and_gaps_are_bridged_all_the_same() -> None:
+    imu, calibration = KNOWN.imu, KNOWN.calibration
+    assert imu is not None
+    assert calibration is not None
+    pairs = [pair for k, pair in enumerate(KNOWN.steps) if k not in (20, 21)]
+    findings = Findings()
+    left_out = replace(calibration, used=False)
+    found = fusing.measurements(pairs, imu, left_out, DRIVE.truth.stamps_ns, findings)
+    assert (found.imu, found.calibration) == (None, None)
+    assert len(found.steps) == len(KNOWN.steps)
+    assert findings.counts == {"gaps_bridged": 1}
