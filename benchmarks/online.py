@@ -63,8 +63,8 @@ def pairs(
     quats_wxyz, translations = motions.rotation.as_quat(scalar_first=True), motions.translation
     ends = truth.stamps_ns[source].tolist(), truth.stamps_ns[target].tolist()
     return [
-        PairEstimate(*stamps, quat_wxyz, translation, np.diag(sigma**2))
-        for *stamps, quat_wxyz, translation in zip(*ends, quats_wxyz, translations, strict=True)
+        PairEstimate(start_ns, end_ns, quat_wxyz, translation, np.diag(sigma**2))
+        for start_ns, end_ns, quat_wxyz, translation in zip(*ends, quats_wxyz, translations, strict=True)
     ]
 
 
@@ -103,7 +103,9 @@ def main() -> None:
     arguments = parser.parse_args()
     known, truth = simulate(arguments.poses, arguments.loops)
 
-    table = Table(title=f"{arguments.poses} poses, {IMU_HZ:.0f} Hz IMU, {arguments.loops} loops, {os.cpu_count()} cores")
+    table = Table(
+        title=f"{arguments.poses} poses, {IMU_HZ:.0f} Hz IMU, {arguments.loops} loops, {os.cpu_count()} cores"
+    )
     for column in ("ms a frame", "median", "99th percentile", "largest"):
         table.add_column(column, justify="right")
     clocks = {"online, wall clock": time.perf_counter, "online, processor": time.process_time}

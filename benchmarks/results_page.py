@@ -141,11 +141,33 @@ positions after rigid alignment, ANEES is 3 where the stated covariances are rig
 [metrics](explanation/metrics.md)."""
 
 REMARKS = {
-    "published": "",
-    "noise": "",
-    "revisit": "",
-    "rendered": "",
-    "wrong": "",
-    "network": "",
-    "timing": "",
+    "published": """\
+A real system's odometry on KITTI 09, which stands in for a front end, with the real IMU of 100 Hz. The mounting and the
+time offset are estimated from the log alone and compared with a fit of the same kind to the rotations of the ground
+truth. What is left between the two is what the odometry's own errors feign: it is several of its stated standard
+deviations. A filter without an IMU still predicts by constant velocity,
+which smooths: it equals raw only where nothing is predicted.""",
+    "noise": """\
+True poses with the errors of a learned front end (`convert trajectory --noise-seed`): rotation, about each axis, 0.011
+deg that fade by 1 % from pair to pair and white 0.05 deg; translation, 0.8 % of it that fade likewise and white 5, 2
+and 20 mm. Beyond 07, 09 and 10, which have targets, fewer seeds are run. The gyro of 00 is faulty in places. How much
+of the remaining error is the scale of the translations, which nothing but the accelerometer tells, shows where r_rel is
+small and t_rel is not.""",
+    "revisit": """\
+The last frames of 09 meet its start. Each of them is tied to the nearest early frame by its true relative pose, with a
+noise of 0.15 m and 0.3 deg for each axis that differs by seed, recorded in the log as `/violearner/loops`. The filter
+is causal and takes no loops.""",
+    "rendered": """\
+Streets are simulated along the real trajectories, with depth from stereo and moving cars, and the real IMU. The network
+estimates the pairs, and loops are looked for in the images. Loops are wrong that are more than 0.5 m or 2 deg off. The
+filter is causal and takes no loops.""",
+    "wrong": """\
+A fifth of the loops are given another source, a frame from anywhere before, as where two places look alike. The change
+is against the run with all loops right, so it includes what the loops that were replaced would have told.""",
+    "network": """\
+Drive 0039 has an IMU of 10 Hz. The clip of 06 is 50 frames of an almost straight road, of whose IMU a part was filled
+in by interpolation and is not used; where too little is left, the IMU is left out and the pose graph equals raw.""",
+    "timing": """\
+Loops between true poses as above, on the longest sequence; wall-clock time of one solution with all covariances, on the
+machine that made this page.""",
 }

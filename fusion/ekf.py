@@ -17,6 +17,9 @@ whose past stays where it was must not jump by that: its positions are the sum o
 they happened (the trail), and the covariance of that sum is carried along exactly, as that of a state which no update
 moves (Schmidt, "Application of state-space methods to navigation problems", 1966).
 
+For the same reason the scale error of the front end is only considered: it widens the covariance, and accelerations do
+not estimate it. What they tell of it within seconds is little beside gravity and their own bias.
+
 Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (error state, reset); Roumeliotis and Burdick,
 "Stochastic cloning", 2002.
 """
@@ -47,7 +50,7 @@ GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the acceler
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
-FRONT_END = slice(17, 21)  # scale error, rate bias
+FRONT_END, SCALE = slice(17, 21), 17  # scale error, rate bias
 MOUNTING, LEVER_ARM, TIME_OFFSET, MISALIGNMENT = slice(21, 24), slice(24, 27), slice(27, 28), slice(28, 31)
 EXTRINSICS, MOUNTED = slice(21, 28), slice(21, 31)
 CLONE_ATTITUDE, CLONE_POSITION = slice(31, 34), slice(34, 37)
@@ -294,6 +297,7 @@ class Filter:
         """Correct by a measurement since the clone (Joseph form), move the error into the state and reset it."""
         shown = self.state.shown(measured.seconds)
         H = shown_jacobian(self.state, shown)
+        before = self.kf.P
         self.kf.update(
             measured.motion,
             HJacobian=lambda _: H,
@@ -301,6 +305,7 @@ class Filter:
             R=measured.covariance,
             residual=lambda motion, prediction: difference(prediction, motion[None])[0],
         )
+        self._consider(before, H, measured.covariance)
         self._move_error(H)
 
     def stand_still(self) -> None:
@@ -314,6 +319,17 @@ class Filter:
             R=STILL_SIGMA**2 * np.eye(3),
         )
         self._move_error(H)
+
+    def _consider(self, before: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        """Take back what an update by H and R did to the scale error; before: the covariance until then.
+
+        Without its row the gain is not the best one, and the covariance follows by Joseph's form, which holds for any.
+        """
+        gain = self.kf.K.copy()
+        gain[SCALE] = 0.0
+        keep = np.eye(DIMENSION) - gain @ H
+        self.kf.K, self.kf.x = gain, gain @ self.kf.y
+        self.kf.P = keep @ before @ keep.T + gain @ R @ gain.T
 
     def _move_error(self, H: FloatArray) -> None:
         """After an update by H (M, 37): move the error into the state, and reset it."""
@@ -470,6 +486,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     stamps_ns = stamps_of(steps)
     series = EstimatorSeries(stamps_ns, *(np.array(column) for column in zip(*rows, strict=True)))
     poses, covariances = (np.stack(column) for column in zip(*cameras, strict=True))
+    covariances[0] = 0.0  # the world itself, but for rounding
     rejected = int(np.sum(~series.used))
     measured = sum(window is not None for window in windows)
     return Estimate(

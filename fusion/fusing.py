@@ -85,4 +85,8 @@ def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findin
 def _solve(name: str, known: Measurements, config: RunConfig) -> Estimate:
     if name == "ekf":
         return ekf.solve(known, config.ekf)
-    return (posegraph if name == "posegraph" else online).solve(known, config.posegraph)
+    return (
+        online.solve(known, config.posegraph)
+        if name == "posegraph_online"
+        else posegraph.solve(known, config.posegraph)
+    )

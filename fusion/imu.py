@@ -155,7 +155,7 @@ def calibrate(
     not_measured_ns = _not_measured(imu)
     imu = _outside(imu, not_measured_ns)
     if len(imu) < MIN_PAIRS:
-        return left_out("its sensors hang or are at the end of their range")
+        return left_out("its gyro or accelerometer hangs, or is at the end of its range")
     changes, doubtful_ns = _clock_jumps(imu, pairs)
     imu = _unchanged(_outside(imu, doubtful_ns), changes)
     gyro, turns = _Gyro(imu), _turns(pairs, int(imu.stamps_ns[0]))

@@ -1,4 +1,4 @@
-"""The pose graph as it runs on a robot: at each instant the pose of the latest frame, from what was measured until then.
+"""The pose graph as it runs on a robot: at each instant the pose of the latest frame, from what was known by then.
 
 Two layers (as in Qin et al., "VINS-Mono", 2018). A *fixed-lag smoother* has the variables and factors of
 `fusion.posegraph` for the last seconds; what leaves its window is marginalised into a Gaussian prior on what stays
@@ -280,7 +280,7 @@ class Smoother:
         twist = self._by_pairs[step].copy()
         if inertial is not None:
             twist[:3] = inertial.window.angular_velocity[piece]
-        return twist
+        return np.asarray(twist)
 
     def _predict(self, step: int) -> None:
         """The variables of a frame where the pair takes them."""
@@ -396,7 +396,7 @@ class Smoother:
             self._point = self._values
             self._linear = self._graph().linearize(self._point)
             A, b = self._linear.jacobian(order)
-            R = np.linalg.qr(np.column_stack([A, b]), mode="r")[: A.shape[1]]
+            R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
             step = solve_triangular(R[:, :-1], R[:, -1])
             if not np.all(np.isfinite(step)):
                 raise RuntimeError(f"the step at frame {self._latest} is not finite")
@@ -454,7 +454,7 @@ class Smoother:
         stay = X(keyframe), G(0), E(0)
         leaving = {
             key
-            for key in self._values.keys()
+            for key in self._values.keys()  # noqa: SIM118  # not a mapping
             if key not in stay and self._age(key)[0] < self._first_of_knot(key, oldest)
         }
         if not leaving:
@@ -539,19 +539,10 @@ def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
 
 
 class _Place(NamedTuple):
-    """A frame in the odometry, and how its drift follows from that of the keyframe before it.
+    """A frame in the odometry or in the world, and how its error follows from that of the keyframe before it.
 
-    xi = slope xi_keyframe + noise of covariance own, perturbing T (4, 4) on the left.
+    xi = slope xi_keyframe + noise of covariance own (6, 6), perturbing T (4, 4) on the left.
     """
-
-    keyframe: int
-    T: FloatArray
-    slope: FloatArray
-    own: FloatArray
-
-
-class _Drifted(NamedTuple):
-    """A frame in the world: T (4, 4), and the errors on its left: slope times those of the keyframe, and its own."""
 
     keyframe: int
     T: FloatArray
@@ -592,7 +583,10 @@ class Map:
         covariance = self._odometry_covariances[number]
         crossed, self._latest_covariance = odometry.joint[6:, :6], odometry.joint[6:, 6:]
         by_keyframe = crossed @ np.linalg.pinv(covariance, hermitian=True)
-        own = self._latest_covariance - by_keyframe @ crossed.T
+        smoothed = np.linalg.pinv(odometry.joint[:6, :6], hermitian=True)
+        least = self._latest_covariance - crossed @ smoothed @ crossed.T
+        # The keyframe was less certain then than it is now, but for errors of linearisation.
+        own = least + _positive(crossed @ smoothed @ crossed.T - by_keyframe @ crossed.T)
         left, back = _adjoint(odometry.T), _adjoint(inverse(self._places[self.last].T))
         self._places.append(_Place(number, odometry.T, left @ by_keyframe @ back, left @ own @ left.T))
         there = self._at(len(self._places) - 1)
@@ -636,19 +630,19 @@ class Map:
         T = _exp(gain @ beyond) @ k.T
         return _seen(T, of_latest - gain @ with_latest.T)
 
-    def _at(self, frame: int) -> _Drifted:
+    def _at(self, frame: int) -> _Place:
         """A frame where it is in the world as far as is known."""
         number, T, slope, own = self._places[frame]
         drift = self._drifts[number]
         here = _exp(slope @ _log(drift))
         turned = _adjoint(here)
-        return _Drifted(number, here @ T, turned @ slope @ _adjoint(inverse(drift)), turned @ own @ turned.T)
+        return _Place(number, here @ T, turned @ slope @ _adjoint(inverse(drift)), turned @ own @ turned.T)
 
     def _rows(self, number: int) -> FloatArray:
         """The covariances (6, 6 N) of a keyframe with all keyframes."""
         return self._covariance[6 * number : 6 * number + 6]
 
-    def _between(self, one: _Drifted, other: _Drifted) -> FloatArray:
+    def _between(self, one: _Place, other: _Place) -> FloatArray:
         """The covariance (6, 6) of what two frames have from their keyframes."""
         columns = slice(6 * other.keyframe, 6 * other.keyframe + 6)
         return np.asarray(one.slope @ self._rows(one.keyframe)[:, columns] @ other.slope.T)
@@ -666,6 +660,12 @@ def _exp(twist: FloatArray) -> FloatArray:
 
 def _adjoint(T: FloatArray) -> FloatArray:
     return np.asarray(gtsam.Pose3(T).AdjointMap())
+
+
+def _positive(matrix: FloatArray) -> FloatArray:
+    """The part of a symmetric matrix that is positive."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _seen(T: FloatArray, on_the_left: FloatArray) -> Pose:

@@ -16,7 +16,8 @@ from fusion_io.records import Trajectory
 
 RUNS, SECONDS = 6, 12.0
 PROBABILITY = 0.9999  # of the bounds: a right estimator leaves one of them in a hundred sets of runs
-# An IMU as noisy as this one blurs the rates that tell its clock, which makes the offset look a little better known.
+# The rates that tell the clock carry noise that is also in the prediction, and the velocities that of the pairs: for an
+# IMU as noisy as this one the offset is known less well than is said.
 BLURRED = "time offset"
 
 

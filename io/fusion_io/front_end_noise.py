@@ -4,7 +4,7 @@ What a network gets wrong in one pair it gets wrong in the next: beside white no
 an autoregressive process of first order, in the rotation (about each axis) and in the scale of the translation.
 
 The defaults are those that give about the errors which VIOLearner has published on KITTI: on 07, 09 and 10, over five
-seeds, a raw chain has a t_rel of 2.6 % and an r_rel of 1.4 deg/100 m (09: 2.5 % and 1.1 deg/100 m).
+seeds, a raw chain has a t_rel of 2.6 % and an r_rel of 1.4 deg/100 m on average.
 """
 
 from __future__ import annotations
