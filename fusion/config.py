@@ -91,31 +91,34 @@ class FusionConfig(Section):
 
     Errors of a front end are correlated in time: beside the covariance of each pair estimate it has a scale error
     (pair_scale_sigma; learned_pair_scale_sigma where the network made the pairs, whose scale is that of the depth) and
-    a rate bias (pair_rate_bias_sigma, rad/s) that change over *_correlation_s, and a constant misalignment of its
-    rotations against its translations (pair_misalignment_sigma, rad).
+    a rate bias (pair_rate_bias_sigma and learned_pair_rate_bias_sigma, rad/s) that change over *_correlation_s, and a
+    constant misalignment of its rotations against its translations (pair_misalignment_sigma, rad).
 
     lever_arm_sigma (m): how far the IMU may be from the camera. gate_probability: how seldom noise alone takes a
     measurement for an outlier.
     """
 
     gyro_noise: PositiveFloat = 1e-3
-    accelerometer_noise: PositiveFloat = 0.05
+    accelerometer_noise: PositiveFloat = 0.07
     gyro_bias_walk: PositiveFloat = 1e-5
     accelerometer_bias_walk: PositiveFloat = 1e-4
     gyro_bias_sigma: PositiveFloat = 2e-4
     accelerometer_bias_sigma: PositiveFloat = 0.2
-    pair_scale_sigma: PositiveFloat = 0.02
+    pair_scale_sigma: PositiveFloat = 0.025
     learned_pair_scale_sigma: PositiveFloat = 0.005
     pair_scale_correlation_s: PositiveFloat = 10.0
     pair_rate_bias_sigma: PositiveFloat = 3e-3
+    learned_pair_rate_bias_sigma: PositiveFloat = 1e-3
     pair_rate_bias_correlation_s: PositiveFloat = 5.0
     pair_misalignment_sigma: PositiveFloat = 1e-2
     lever_arm_sigma: PositiveFloat = 1.0
     gate_probability: Probability = 1e-6
 
-    def scale_sigma(self, pairs: Sequence[PairEstimate]) -> float:
-        """That of the front end that made the pairs."""
-        return self.learned_pair_scale_sigma if any(pair.winner >= 0 for pair in pairs) else self.pair_scale_sigma
+    def front_end_sigma(self, pairs: Sequence[PairEstimate]) -> tuple[float, float]:
+        """Those of scale error and rate bias of the front end that made the pairs: the network, or another."""
+        if any(pair.winner >= 0 for pair in pairs):
+            return self.learned_pair_scale_sigma, self.learned_pair_rate_bias_sigma
+        return self.pair_scale_sigma, self.pair_rate_bias_sigma
 
 
 class PoseGraphConfig(FusionConfig):
@@ -150,7 +153,6 @@ class EkfConfig(FusionConfig):
     """
 
     accelerometer_noise: PositiveFloat = 1.0
-    pair_scale_sigma: PositiveFloat = 0.025
     pair_scale_correlation_s: PositiveFloat = 30.0
     mounting_sigma: PositiveFloat = 6e-3
     time_offset_sigma: PositiveFloat = 5e-3

@@ -47,6 +47,9 @@ from fusion_io.records import EstimatorSeries, FloatArray, IntArray, PairEstimat
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 
+# rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz): so much that a prediction is worth nothing beside any pair.
+ANY_MOTION = 1e3, 2e5
+
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
@@ -214,17 +217,20 @@ class Filter:
         config: EkfConfig,
         calibration: ImuCalibration | None,
         mounting: Mounting | None,
-        scale_sigma: float,
+        front_end_sigma: tuple[float, float],
         camera_twist: FloatArray,
     ) -> None:
         """camera_twist (6,): of the camera at first, in its own axes, rotation first; it need not be exact."""
         self.config = config
+        self.unknown = config.angular_acceleration, config.acceleration
         zero = np.zeros(3)
         T_camera_imu, gyro_bias = np.eye(4), zero
         sigma = np.zeros(DIMENSION)
         sigma[VELOCITY] = config.velocity_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
-        if calibration is not None:
+        if calibration is None:
+            self.unknown = ANY_MOTION
+        else:
             T_camera_imu[:3, :3] = calibration.mounting.inv().as_matrix()
             gyro_bias = calibration.gyro_bias
             sigma[GYRO_BIAS] = np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)
@@ -236,7 +242,7 @@ class Filter:
         ahead_s, misalignment = 0.0, zero
         if mounting is not None:
             T_camera_imu, ahead_s, misalignment = mounting.T_camera_imu, mounting.ahead_s, mounting.misalignment
-        self.front_end_sigma = np.repeat([scale_sigma, config.pair_rate_bias_sigma], [1, 3])
+        self.front_end_sigma = np.repeat(front_end_sigma, [1, 3])
         sigma[FRONT_END] = self.front_end_sigma
         P = np.diag(sigma**2)
         if mounting is not None:
@@ -411,8 +417,9 @@ class Filter:
         F[ATTITUDE, ATTITUDE] = turn.T
         F[POSITION, VELOCITY] = np.eye(3) * seconds
         variances = seconds * self.imu_walk
-        variances[ATTITUDE] = self.config.angular_acceleration**2 * seconds**3
-        self._spread(F[None], variances[None], self.config.acceleration, np.array([seconds]))
+        angular_acceleration, acceleration = self.unknown
+        variances[ATTITUDE] = angular_acceleration**2 * seconds**3
+        self._spread(F[None], variances[None], acceleration, np.array([seconds]))
 
     def _drift(self, seconds: float) -> None:
         """Let the lasting errors of the front end fade and wander: Gauss-Markov processes."""
@@ -443,7 +450,8 @@ class Filter:
 def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     """Filter the steps, which follow each other, with the IMU where there is one.
 
-    Steps that it did not measure from start to end are predicted by constant velocity and rate. Loops, pairs that skip
+    Steps that it did not measure from start to end are predicted by constant velocity and rate; without any that it
+    measured nothing is predicted, and the poses are those of the chain. Loops, pairs that skip
     frames and positions are not used: they speak of poses that a filter has left behind.
     """
     steps, calibration = measurements.steps, measurements.calibration
@@ -453,7 +461,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
         calibration = None
     still = standing_still(steps, windows, np.zeros(3) if calibration is None else calibration.gyro_bias)
     first_twist = steps[0].T_source_target.as_exp_coords() / steps[0].duration_s
-    ekf = Filter(config, calibration, measurements.mounting, config.scale_sigma(steps), first_twist)
+    ekf = Filter(config, calibration, measurements.mounting, config.front_end_sigma(steps), first_twist)
     gate = chi2.isf(config.gate_probability, 6)
     rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [ekf.camera()]
     in_a_row = 0
@@ -548,7 +556,7 @@ def _without_biases(series: EstimatorSeries) -> EstimatorSeries:
 def _note(measured: int, steps: int, rejected: int) -> str:
     left_out = f"; pairs rejected: {rejected}" if rejected else ""
     if measured == 0:
-        return f"predicted by constant velocity: no IMU{left_out}"
+        return f"pairs only: no IMU{left_out}"
     if measured < steps:
         return f"predicted by the IMU on {measured} of {steps} steps, by constant velocity on the others{left_out}"
     return f"predicted by the IMU{left_out}"

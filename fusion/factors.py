@@ -12,19 +12,27 @@ from collections.abc import Callable, Sequence
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import E, L, S, U, X
+from scipy.ndimage import gaussian_filter1d, median_filter
 
 from fusion.chain import motions_of
 from fusion.pair_model import camera, difference, exp, predict, right_jacobian, skew
 from fusion_io.records import FloatArray, IntArray, PairEstimate
 
+SMOOTHED_OUTLIERS, SMOOTHING_SIGMA = 5, 10.0  # pairs: width of the median, sigma of the mean after it
+
 NO_KNOT = -1  # of a pair estimate without a state of the front end
 
 
 class Batch(ABC):
-    """N factors of one kind with errors of D components, whitened, times the root of their weights (N,)."""
+    """N factors of one kind with errors of D components, whitened, times the root of their weights (N,).
 
-    def __init__(self, keys: Sequence[Sequence[int]], dimension: int) -> None:
+    judged: whether they are measurements that can be outliers; least_weight: what an outlier keeps.
+    """
+
+    def __init__(self, keys: Sequence[Sequence[int]], dimension: int, judged: bool = True) -> None:
         self.weights = np.ones(len(keys))
+        self.judged = judged
+        self.least_weight = 0.0
         self.dimension = dimension
         self._keys = keys
         self._errors = np.zeros((len(keys), dimension))
@@ -90,6 +98,7 @@ class PairFactors(Batch):
         self._twists = (still, still) if twists is None else (twists[source], twists[target])
         self._measured = motions_of(pairs).as_matrix() if pairs else np.zeros((0, 4, 4))
         self._seconds = np.array([pair.duration_s for pair in pairs])
+        self._reference = _smooth(self._measured[:, :3, 3], self._seconds)
         self._whiteners = np.linalg.inv(np.linalg.cholesky(np.array([p.covariance for p in pairs]).reshape(-1, 6, 6)))
         self.residual = np.zeros((len(pairs), 6))
 
@@ -109,6 +118,7 @@ class PairFactors(Batch):
             strayed[7:],
             front_end,
             self._seconds,
+            self._reference,
         )
         self.residual = difference(shown.motion, self._measured)
         errors = -np.einsum("nij,nj->ni", self._whiteners, self.residual)
@@ -138,7 +148,7 @@ class WorldFactor(Batch):
     """The first camera is the world: eq. (1) of `fusion.pair_model` gives the identity for X(0) and E(0)."""
 
     def __init__(self, T_camera_imu: FloatArray, twist: FloatArray, sigma: float) -> None:
-        super().__init__([[X(0), E(0)]], 6)
+        super().__init__([[X(0), E(0)]], 6, judged=False)
         self._T_camera_imu, self._twist, self._sigma = T_camera_imu, twist, sigma
 
     def _evaluate(self, values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
@@ -197,3 +207,9 @@ def poses_of(values: gtsam.Values) -> FloatArray:
 def padded(by_extrinsics: FloatArray) -> FloatArray:
     """Jacobians (N, 6, 7) with nothing for the misalignment: (N, 6, 10)."""
     return np.concatenate([by_extrinsics, np.zeros((len(by_extrinsics), 6, 3))], axis=2)
+
+
+def _smooth(translations: FloatArray, seconds: FloatArray) -> FloatArray:
+    """Translations (N, 3) of pairs in order of time at the speed of their neighbours, without outliers and noise."""
+    rates = median_filter(translations / seconds[:, None], (SMOOTHED_OUTLIERS, 1), mode="nearest")
+    return np.asarray(gaussian_filter1d(rates, SMOOTHING_SIGMA, axis=0, mode="nearest") * seconds[:, None])

@@ -187,7 +187,7 @@ class AntennaFactor(Batch):
     """Where the antenna is thought to be in camera axes (3,), for L(0) in the axes of X and E(0)."""
 
     def __init__(self, T_camera_imu: FloatArray, antenna_m: FloatArray, sigma_m: float) -> None:
-        super().__init__([[L(0), E(0)]], 3)
+        super().__init__([[L(0), E(0)]], 3, judged=False)
         self._T_camera_imu, self._antenna_m, self._sigma_m = T_camera_imu, antenna_m, sigma_m
 
     def _evaluate(self, values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
@@ -200,7 +200,7 @@ class UprightFactor(Batch):
     """Gravity G(0) points down in the local frame that U(0) leads to."""
 
     def __init__(self, sigma_rad: float) -> None:
-        super().__init__([[U(0), G(0)]], 2)
+        super().__init__([[U(0), G(0)]], 2, judged=False)
         self._sigma_rad = sigma_rad
 
     def _evaluate(self, values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:

@@ -59,6 +59,7 @@ STEP_BATCH_S = 5.0  # as long as errors of pairs are correlated
 STEP_MIN_PAIRS = 20  # on either side
 STEP_MIN_BATCHES = 5
 STEP_CHANCE = 1e-6
+STEP_MIN = 8e-3  # rad/s: below, the drift of a front end can look like it
 
 # Where gyro and pairs disagree for long, the gyro is at fault too: front ends fail for single pairs, but an IMU that
 # saturates or loses its clock does so for a while.
@@ -71,7 +72,7 @@ CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
 # bare gyros sharply, and yet show a difference that can be chance and their own drift.
 BARE_GYRO_BIAS = 1e-2  # rad/s
 SHARP = 0.1  # of it
-CHANCE = 0.02
+CHANCE = 2e-3
 BATCHES = 5  # whose scatter shows how uncertain the mean of errors is that are correlated in time
 PAIR_DRIFT = 3e-4  # rad/s: constant over a log, so that no scatter shows it
 
@@ -535,7 +536,8 @@ def _bias_step(fit: _Fit) -> tuple[float, FloatArray, float] | None:
     means = np.stack([level[number == k].mean(axis=0) for k in numbers])
     share = split / pairs
     variance = float(np.mean(np.var(means, axis=0, ddof=1))) / (count * share * (1.0 - share))
-    if step @ step < 3.0 * variance * f_distribution.isf(STEP_CHANCE, 3, 3 * (count - 2)):
+    chance = 3.0 * variance * f_distribution.isf(STEP_CHANCE, 3, 3 * (count - 2))
+    if step @ step < max(chance, STEP_MIN**2):
         return None
     return float(fit.turns.source_s[split]), step, float(np.sqrt(variance))
 

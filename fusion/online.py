@@ -230,7 +230,7 @@ class Smoother:
         by_pair = self._by_pairs[step, :3]
         by_gyro = gtsam.Rot3.Logmap(measured.preintegrated.deltaRij()) / seconds
         of_pair = np.trace(self._steps[step].covariance[:3, :3]) / 3 / seconds**2
-        variance = of_pair + self._config.pair_rate_bias_sigma**2
+        variance = of_pair + self._config.front_end_sigma(self._steps[:1])[1] ** 2
         if np.sum((by_pair - by_gyro) ** 2) <= self._gate * variance:
             return False, False
         gyro_away, pair_away = (np.linalg.norm(rate - self._twist[:3]) for rate in (by_gyro, by_pair))
@@ -241,7 +241,7 @@ class Smoother:
         config, calibration = self._config, self._calibration
         self._values.insert(X(0), gtsam.Pose3(self._T_camera_imu))
         self._values.insert(S(0), np.zeros(4))
-        front_end = np.repeat([config.scale_sigma(self._steps[:1]), config.pair_rate_bias_sigma], [1, 3])
+        front_end = np.repeat(config.front_end_sigma(self._steps[:1]), [1, 3])
         self._factors.append(gtsam.PriorFactorVector(S(0), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(front_end)))
         if calibration is None:
             fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
@@ -303,7 +303,7 @@ class Smoother:
         self._knots.append(knot + 1)
         self._begins.append(self._latest)
         self._values.insert(S(knot + 1), self._values.atVector(S(knot)))
-        self._factors.append(front_end_walk(knot, dt, config.scale_sigma(self._steps[:1]), config))
+        self._factors.append(front_end_walk(knot, dt, config.front_end_sigma(self._steps[:1]), config))
         if self._calibration is not None:
             self._values.insert(B(knot + 1), self._values.atConstantBias(B(knot)))
             walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3) * np.sqrt(dt)
@@ -478,9 +478,9 @@ class Smoother:
         return self._begins[self._knots[oldest]] if chr(gtsam.Symbol(key).chr()) in "bs" else oldest
 
 
-def front_end_walk(knot: int, dt: float, scale_sigma: float, config: PoseGraphConfig) -> gtsam.NonlinearFactor:
+def front_end_walk(knot: int, dt: float, sigmas: tuple[float, float], config: PoseGraphConfig) -> gtsam.NonlinearFactor:
     """From one state of the front end to the next after dt seconds: a Gauss-Markov process."""
-    sigma = np.repeat([scale_sigma, config.pair_rate_bias_sigma], [1, 3])
+    sigma = np.repeat(sigmas, [1, 3])
     keep = np.exp(-dt / np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3]))
     whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
     unit = gtsam.noiseModel.Unit.Create(4)
@@ -539,14 +539,13 @@ def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
 
 
 class _Place(NamedTuple):
-    """A frame in the odometry or in the world, and how its error follows from that of the keyframe before it.
+    """A frame by its odometry T (4, 4), and by how much more it may have drifted than the keyframe before it.
 
-    xi = slope xi_keyframe + noise of covariance own (6, 6), perturbing T (4, 4) on the left.
+    own (6, 6): covariance of that, on the right of T.
     """
 
     keyframe: int
     T: FloatArray
-    slope: FloatArray
     own: FloatArray
 
 
@@ -558,19 +557,19 @@ class Map:
 
         Ad(X_k) Log((X_i^-1 X_k)^-1 Z) = xi_k - xi_i + noise                                                         (1)
 
-    The drift at a frame follows from that at the keyframe before it by their joint covariance in the odometry, which
-    makes the keyframes a Markov chain: that with the odometry's own covariance at every frame.
+    Drift is a random walk. It grows as the odometry's covariance does, and no less than by that of the motion since the
+    keyframe: errors that last, of scale for one, add up faster than white ones.
     """
 
     def __init__(self, gate_probability: float) -> None:
         self._gate = float(chi2.isf(gate_probability, 6))
-        origin = _Place(0, np.eye(4), np.eye(6), np.zeros((6, 6)))
-        self._places = [origin]
+        self._places = [_Place(0, np.eye(4), np.zeros((6, 6)))]
         self._keyframes = [0]  # their frames
-        self._odometry_covariances = [np.zeros((6, 6))]
         self._drifts = np.tile(np.eye(4), (ROOM, 1, 1))
         self._covariance = np.zeros((6 * ROOM, 6 * ROOM), order="F")
+        self._odometry_covariance = np.zeros((6, 6))  # of the last keyframe, when it was the latest frame
         self._latest_covariance = np.zeros((6, 6))
+        self._closed = False
 
     @property
     def last(self) -> int:
@@ -579,73 +578,73 @@ class Map:
 
     def move_to(self, odometry: Odometry) -> Pose:
         """The next frame."""
-        number = len(self._keyframes) - 1
-        covariance = self._odometry_covariances[number]
-        crossed, self._latest_covariance = odometry.joint[6:, :6], odometry.joint[6:, 6:]
-        by_keyframe = crossed @ np.linalg.pinv(covariance, hermitian=True)
-        smoothed = np.linalg.pinv(odometry.joint[:6, :6], hermitian=True)
-        least = self._latest_covariance - crossed @ smoothed @ crossed.T
-        # The keyframe was less certain then than it is now, but for errors of linearisation.
-        own = least + _positive(crossed @ smoothed @ crossed.T - by_keyframe @ crossed.T)
-        left, back = _adjoint(odometry.T), _adjoint(inverse(self._places[self.last].T))
-        self._places.append(_Place(number, odometry.T, left @ by_keyframe @ back, left @ own @ left.T))
-        there = self._at(len(self._places) - 1)
-        return _seen(there.T, self._between(there, there) + there.own)
+        back = _adjoint(inverse(odometry.T) @ self._places[self.last].T)
+        since = np.hstack([-back, np.eye(6)])
+        least = since @ odometry.joint @ since.T
+        self._latest_covariance = odometry.joint[6:, 6:]
+        grown = self._latest_covariance - back @ self._odometry_covariance @ back.T
+        self._places.append(_Place(len(self._keyframes) - 1, odometry.T, least + _positive(grown - least)))
+        if not self._closed:
+            return Pose(odometry.T, self._latest_covariance)
+        T, own = self._at(-1)
+        return _seen(T, self._between(-1, -1) + own)
 
     def keep(self) -> None:
         """Make the latest frame a keyframe."""
-        there = self._at(len(self._places) - 1)
-        number = len(self._keyframes)
+        _, own = self._at(-1)
+        before, number = self._places[-1].keyframe, len(self._keyframes)
         if number == len(self._drifts):
             self._drifts = np.concatenate([self._drifts, np.tile(np.eye(4), (ROOM, 1, 1))])
             self._covariance = np.asfortranarray(np.pad(self._covariance, (0, 6 * ROOM)))
-        here = slice(6 * number, 6 * number + 6)
-        self._covariance[here] = there.slope @ self._rows(there.keyframe)
+        here = _block(number)
+        self._covariance[here] = self._covariance[_block(before)]
         self._covariance[:, here] = self._covariance[here].T
-        self._covariance[here, here] = self._between(there, there) + there.own
-        self._drifts[number] = there.T @ inverse(self._places[-1].T)
+        self._covariance[here, here] = self._covariance[_block(before), _block(before)] + own
+        self._drifts[number] = self._drifts[before]
         self._keyframes.append(len(self._places) - 1)
-        self._odometry_covariances.append(self._latest_covariance)
-        self._places[-1] = _Place(number, self._places[-1].T, np.eye(6), np.zeros((6, 6)))
+        self._places[-1] = _Place(number, self._places[-1].T, np.zeros((6, 6)))
+        self._odometry_covariance = self._latest_covariance
 
     def close(self, source: int, loop: PairEstimate) -> Pose | None:
         """The latest pose after a loop from a frame to it; None where the loop is an outlier, and nothing changes."""
-        i, k = self._at(source), self._at(len(self._places) - 1)
-        to_world = _adjoint(k.T)
-        measured = np.asarray(loop.T_source_target.as_matrix())
-        shown = inverse(i.T) @ k.T
-        beyond = to_world @ _log(inverse(shown) @ measured)
-        rows = k.slope @ self._rows(k.keyframe) - i.slope @ self._rows(i.keyframe)
-        of_latest = self._between(k, k) + k.own
-        with_latest = of_latest - self._between(k, i)
-        spread = with_latest - self._between(i, k) + self._between(i, i) + i.own
+        (T_source, own_source), (T, own) = self._at(source), self._at(-1)
+        to_world = _adjoint(T)
+        shown = inverse(T_source) @ T
+        beyond = to_world @ _log(inverse(shown) @ np.asarray(loop.T_source_target.as_matrix()))
+        rows = self._rows(-1) - self._rows(source)
+        of_latest = self._between(-1, -1) + own
+        with_latest = of_latest - self._between(-1, source)
+        spread = with_latest - self._between(source, -1) + self._between(source, source) + own_source
         spread += to_world @ loop.covariance @ to_world.T
-        if beyond @ np.linalg.solve(spread, beyond) > self._gate:
+        root = np.linalg.cholesky((spread + spread.T) / 2)
+        beyond, rows, row = (solve_triangular(root, each, lower=True) for each in (beyond, rows, with_latest.T))
+        if beyond @ beyond > self._gate:
             return None
-        gains = np.linalg.solve(spread, rows)
-        dgemm(-1.0, rows, gains, beta=1.0, c=self._covariance, trans_a=True, overwrite_c=True)
-        moved = RigidTransform.from_exp_coords((beyond @ gains).reshape(-1, 6))
+        # Of this form it stays symmetric: what rounding leaves would grow from loop to loop.
+        dgemm(-1.0, rows, rows, beta=1.0, c=self._covariance, trans_a=True, overwrite_c=True)
+        moved = RigidTransform.from_exp_coords((beyond @ rows).reshape(-1, 6))
         self._drifts = np.asarray(moved.as_matrix()) @ self._drifts
-        gain = np.linalg.solve(spread, with_latest.T).T
-        T = _exp(gain @ beyond) @ k.T
-        return _seen(T, of_latest - gain @ with_latest.T)
+        self._closed = True
+        return _seen(_exp(beyond @ row) @ T, of_latest - row.T @ row)
 
-    def _at(self, frame: int) -> _Place:
-        """A frame where it is in the world as far as is known."""
-        number, T, slope, own = self._places[frame]
-        drift = self._drifts[number]
-        here = _exp(slope @ _log(drift))
-        turned = _adjoint(here)
-        return _Place(number, here @ T, turned @ slope @ _adjoint(inverse(drift)), turned @ own @ turned.T)
+    def _at(self, frame: int) -> tuple[FloatArray, FloatArray]:
+        """A frame in the world (4, 4), and the covariance (6, 6) on its left of what it has not from its keyframe."""
+        number, odometry, own = self._places[frame]
+        T = self._drifts[number] @ odometry
+        to_world = _adjoint(T)
+        return T, to_world @ own @ to_world.T
 
-    def _rows(self, number: int) -> FloatArray:
-        """The covariances (6, 6 N) of a keyframe with all keyframes."""
-        return self._covariance[6 * number : 6 * number + 6]
+    def _rows(self, frame: int) -> FloatArray:
+        """The covariances (6, 6 N) of a frame with all keyframes."""
+        return self._covariance[_block(self._places[frame].keyframe)]
 
-    def _between(self, one: _Place, other: _Place) -> FloatArray:
+    def _between(self, one: int, other: int) -> FloatArray:
         """The covariance (6, 6) of what two frames have from their keyframes."""
-        columns = slice(6 * other.keyframe, 6 * other.keyframe + 6)
-        return np.asarray(one.slope @ self._rows(one.keyframe)[:, columns] @ other.slope.T)
+        return np.asarray(self._rows(one)[:, _block(self._places[other].keyframe)])
+
+
+def _block(number: int) -> slice:
+    return slice(6 * number, 6 * number + 6)
 
 
 def _log(T: FloatArray) -> FloatArray:

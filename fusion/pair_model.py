@@ -10,7 +10,10 @@ and an estimate of the motion Z = C_source^-1 C_target over dt seconds shows it 
 last: a misalignment m between the axes of its rotations and those of its translations, as a camera has that is not
 perfectly calibrated, a rate bias b and a scale error s:
 
-    R_shown = Exp(m) R_Z Exp(-m) Exp(b dt),   t_shown = (1 + s) t_Z                                                  (2)
+    R_shown = Exp(m) R_Z Exp(-m) Exp(b dt),   t_shown = t_Z + s r                                                    (2)
+
+The reference r is about t_Z. Were it t_Z itself, scale and motion were a product of two unknowns, and the most likely
+of all solutions would make the motion short and the scale long, because that shortens what the IMU has to explain.
 
 Perturbations act on the right and are ordered rotation first. All functions work on N motions at once.
 """
@@ -54,10 +57,12 @@ def predict(
     misalignment: FloatArray,
     front_end: FloatArray,
     seconds: FloatArray,
+    reference: FloatArray | None = None,
 ) -> Prediction:
     """Equations (1) and (2) for poses source, target (N, 4, 4), T_camera_imu (4, 4), the twists (N, 6) at both.
 
-    ahead_s: d. misalignment (3,): m. front_end (N, 4): s, then b. seconds (N,): dt.
+    ahead_s: d. misalignment (3,): m. front_end (N, 4): s, then b. seconds (N,): dt. reference (N, 3): r,
+    None for t_Z as it is now.
     """
     camera_source, by_source, of_source = camera(source, T_camera_imu, twists[0], ahead_s)
     camera_target, by_target, of_target = camera(target, T_camera_imu, twists[1], ahead_s)
@@ -66,12 +71,13 @@ def predict(
 
     turn = front_end[:, 1:] * seconds[:, None]
     unturn = exp(-turn)
-    stretch = 1.0 + front_end[:, :1]
+    stretch = 1.0 + front_end[:, :1] if reference is None else np.ones((len(motion), 1))
+    reference = motion[:, :3, 3] if reference is None else reference
     aligned = exp(misalignment)
     turned = aligned @ motion[:, :3, :3] @ aligned.T
     shown = motion.copy()
     shown[:, :3, :3] = turned @ unturn.swapaxes(1, 2)
-    shown[:, :3, 3] *= stretch
+    shown[:, :3, 3] += front_end[:, :1] * reference
     by_motion = np.zeros((len(motion), 6, 6))
     by_motion[:, :3, :3] = unturn @ aligned
     by_motion[:, 3:, 3:] = stretch[:, :, None] * shown[:, :3, :3].swapaxes(1, 2) @ motion[:, :3, :3]
@@ -79,7 +85,7 @@ def predict(
     by_misalignment[:, :3] = unturn @ (turned.swapaxes(1, 2) - np.eye(3)) @ right_jacobian(-misalignment)
     by_front_end = np.zeros((len(motion), 6, 4))
     by_front_end[:, :3, 1:] = right_jacobian(turn) * seconds[:, None, None]
-    by_front_end[:, 3:, 0] = np.einsum("nji,nj->ni", shown[:, :3, :3], motion[:, :3, 3])
+    by_front_end[:, 3:, 0] = np.einsum("nji,nj->ni", shown[:, :3, :3], reference)
     return Prediction(
         shown,
         -by_motion @ back @ by_source,

@@ -50,7 +50,7 @@ MAX_ITERATIONS = 30
 FORGIVING_ITERATIONS = 2  # before anything is judged
 CONVERGED = 3e-4  # root mean square of a step over all variables, that is mostly m, that ends the iteration
 ANNEALING = 10.0  # of the kernel's width from step to step
-REJECTED_WEIGHT = 1e-4  # of a measurement that is left out: no more than a hint, where nothing else is known
+REJECTED_WEIGHT = 1e-4  # of a step whose pair is left out: no more than a hint, where nothing else is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,11 +131,12 @@ def _solve(
     start = _repaired(steps, windows, wrong.pair, mounting, bias)
     problem = _pairs_only(steps, start) if inertial is None else _with_imu(steps, start, windows, inertial, config)
     pairs = _add_pairs(problem, steps, problem.knots[:-1])
+    pairs.least_weight = REJECTED_WEIGHT
     pairs.weights[wrong.pair] = REJECTED_WEIGHT
     begin = np.searchsorted(problem.stamps_ns, [skip.source_stamp_ns for skip in measurements.skips])
     skips = _add_pairs(problem, measurements.skips, problem.knots[begin])
     loops = _add_pairs(problem, measurements.loops, NO_KNOT)
-    _add_front_end(problem, config.scale_sigma(steps), config)
+    _add_front_end(problem, config.front_end_sigma(steps), config)
     tie, without_gnss = gnss.tie(problem, measurements.gnss)
     solution = minimise(problem, config)
 
@@ -354,9 +355,9 @@ def _add_pairs(problem: Problem, pairs: Sequence[PairEstimate], knots: IntArray 
     return factors
 
 
-def _add_front_end(problem: Problem, scale_sigma: float, config: PoseGraphConfig) -> None:
+def _add_front_end(problem: Problem, front_end_sigma: tuple[float, float], config: PoseGraphConfig) -> None:
     """The lasting errors of the front end fade and wander: a Gauss-Markov process."""
-    sigma = np.repeat([scale_sigma, config.pair_rate_bias_sigma], [1, 3])
+    sigma = np.repeat(front_end_sigma, [1, 3])
     correlation_s = np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3])
     unit = gtsam.noiseModel.Unit.Create(4)
     first = _first(problem.knots)
@@ -384,18 +385,17 @@ def _diagonal(sigmas: FloatArray) -> gtsam.noiseModel.Diagonal:
 
 def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
     """Gauss-Newton with QR, step by step less forgiving to measurements that may be wrong."""
-    gates = [chi2.isf(config.gate_probability, batch.dimension) for batch in problem.batches]
+    judged = [batch for batch in problem.batches if batch.judged]
+    gates = [chi2.isf(config.gate_probability, batch.dimension) for batch in judged]
     order = elimination_order(problem)
     values, width = problem.values, np.inf
     for iteration in range(MAX_ITERATIONS):
         for batch in problem.batches:
             batch.update(values)
         if iteration == FORGIVING_ITERATIONS:
-            width = max(
-                batch.squared.max(initial=0.0) / gate for batch, gate in zip(problem.batches, gates, strict=True)
-            )
+            width = max(batch.squared.max(initial=0.0) / gate for batch, gate in zip(judged, gates, strict=True))
         if iteration >= FORGIVING_ITERATIONS:
-            width = _reweigh(problem.batches, gates, width, config.robust)
+            width = _reweigh(judged, gates, width, config.robust)
         tree = problem.graph.linearize(values).eliminateMultifrontal(order, gtsam.EliminateQR)
         step = tree.optimize()
         values = values.retract(step)
@@ -444,9 +444,9 @@ def _reweigh(batches: Sequence[Batch], gates: Sequence[float], width: float, rob
         if robust == "huber":
             batch.weights = 1.0 / np.sqrt(np.maximum(beyond, 1.0))
         elif robust == "gnc" and width > 1.0:
-            batch.weights = np.maximum((width / (width + beyond)) ** 2, REJECTED_WEIGHT)
+            batch.weights = np.maximum((width / (width + beyond)) ** 2, batch.least_weight)
         elif robust == "gnc":
-            batch.weights = np.where(beyond > 1.0, REJECTED_WEIGHT, 1.0)
+            batch.weights = np.where(beyond > 1.0, batch.least_weight, 1.0)
     return width / ANNEALING if robust == "gnc" and width > 1.0 else min(width, 1.0)
 
 

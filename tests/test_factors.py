@@ -32,7 +32,8 @@ def _values(rng: np.random.Generator) -> gtsam.Values:
     for k, pose in enumerate(_transforms(rng, FRAMES)):
         values.insert(X(k), gtsam.Pose3(pose))
     for j in range(2):
-        values.insert(S(j), 0.1 * rng.normal(size=4))
+        # No scale error: its reference is not the motion itself, so that errors would not be zero.
+        values.insert(S(j), np.append(0.0, 0.1 * rng.normal(size=3)))
     values.insert(E(0), 0.3 * rng.normal(size=10))
     values.insert(U(0), gtsam.Pose3(_transforms(rng, 1)[0]))
     values.insert(L(0), rng.normal(size=3))

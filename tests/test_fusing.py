@@ -66,7 +66,7 @@ def test_the_filter_uses_no_imu_that_the_pose_graph_had_to_leave_out() -> None:
     )
     estimates = fusing.fuse(replace(KNOWN, imu=short), CONFIG, Findings())
     assert estimates["posegraph"].note.startswith("pairs only: the IMU measured")
-    assert estimates["ekf"].note == "predicted by constant velocity: no IMU"
+    assert estimates["ekf"].note == "pairs only: no IMU"
 
 
 @pytest.mark.parametrize("broken", ["posegraph", "ekf"])
