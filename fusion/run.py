@@ -224,7 +224,11 @@ def loop_closures(log: Log, raw: Trajectory, config: RunConfig, findings: Findin
     from fusion.loops import find_loops
     from fusion_io.messages import decode_pair, encode_pair
 
-    found = find_loops(log, raw, config.frontend.weights, config.loops, findings)
+    try:
+        found = find_loops(log, raw, config.frontend.weights, config.loops, findings)
+    except LogError as error:  # recorded pairs need no images that can be used
+        findings.remark(f"loops were not looked for: {error}")
+        return []
     return [decode_pair(encode_pair(loop)) for loop in found]
 
 

@@ -54,7 +54,7 @@ def _fused(log: Log) -> Result:
 
 @cache
 def _drive() -> Log:
-    return faults.simulated(2, SECONDS)
+    return faults.simulated(1, SECONDS)
 
 
 @cache
@@ -180,7 +180,7 @@ def test_wrong_pairs_are_named_as_events() -> None:
 
 def test_standing_still_for_a_minute_costs_nothing() -> None:
     """ATE, and what either back end moves by during the minute, are at most 1.05 times what they are of raw."""
-    log = faults.simulated(2, SECONDS, stand_still_s=60.0)
+    log = faults.simulated(1, SECONDS, stand_still_s=60.0)
     result = _fused(log)
     _assert_no_worse(result)
     seconds = (log.truth.stamps_ns - log.truth.stamps_ns[0]) / NANOSECONDS

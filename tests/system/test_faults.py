@@ -25,7 +25,7 @@ def _no_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def drive() -> faults.Log:
-    return faults.simulated(2, 50.0)
+    return faults.simulated(1, 50.0)
 
 
 def _run(drive: faults.Log, folder: Path) -> dict[str, Any]:
