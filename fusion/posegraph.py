@@ -23,6 +23,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, E, G, L, S, U, V, X
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
@@ -42,7 +43,8 @@ FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that 
 INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
 MIN_WINDOWS = 20
 MAX_CONTRADICTED = 0.2  # share of the pairs: where more seem to be wrong, it is the IMU that is
-MAX_IMU_SQUARE = 6.0  # median of its squared errors, of which an IMU as good as its noise has less than one
+MAX_IMU_SQUARE = 4.0  # median, over IMU_STEPS, of the squared errors of IMU factors; sound logs have up to 2.6
+IMU_STEPS = 51
 KNOT_S = 1.0  # between states of the front end
 MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance is singular but for rounding
 
@@ -166,8 +168,9 @@ def _refuse_contradiction(
         raise RuntimeError(f"it contradicts {contradicted.sum()} of {len(contradicted)} pairs")
     factors = (graph.at(i) for i in range(graph.size()))
     squares = [2.0 * each.error(values) for each in factors if isinstance(each, gtsam.ImuFactorWithGravityDirection)]
-    if squares and np.median(squares) > MAX_IMU_SQUARE:
-        raise RuntimeError(f"the IMU is {np.sqrt(np.median(squares)):.1f} standard deviations off the motion")
+    worst = np.max(median_filter(squares, IMU_STEPS, mode="nearest"), initial=0.0)
+    if worst > MAX_IMU_SQUARE:
+        raise RuntimeError(f"the IMU is {np.sqrt(worst):.1f} standard deviations off the motion for seconds")
 
 
 def check(pairs: Sequence[PairEstimate]) -> None:

@@ -159,12 +159,12 @@ def test_dropped_frames_are_bridged(count: int) -> None:
 
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.2])
 def test_pairs_that_are_wildly_wrong_are_left_out(share: float) -> None:
-    """Either back end: nine tenths of them are rejected, and the ATE is at most 1.5 times that without them."""
+    """Either back end: nine tenths of them are rejected, and the ATE is below that of raw without them."""
     pairs, wrong = faults.wrong_pairs(_drive().pairs, share, 0)
     result = _fused(replace(_drive(), pairs=pairs))
     _assert_no_worse(result)
     for name, estimate in result.estimates.items():
-        assert result.ate_m[name] < 1.5 * _sound().ate_m[name], (name, result.ate_m, _sound().ate_m)
+        assert result.ate_m[name] < _sound().ate_m["raw"], (name, result.ate_m, _sound().ate_m)
         assert estimate.series is not None
         assert np.mean(~estimate.series.used[1:][wrong]) >= 0.9
 
