@@ -142,10 +142,11 @@ class EkfConfig(FusionConfig):
     """The error-state Kalman filter back end.
 
     Its accelerometer_noise is larger than that of the pose graph: what accelerations tell of scale and attitude is true
-    over many seconds, and a filter would believe it at once. mounting_sigma (rad), time_offset_sigma (s): where the
-    pose graph has not refined them. gravity_sigma (rad): of its direction at first, which accelerations hide.
-    velocity_sigma (m/s): at first, when nothing is known of it. stamp_jitter_s: how far a frame's stamp may be from
-    when it was taken.
+    over many seconds, and a filter would believe it at once. Lasting errors of the front end last longer here: what of
+    them is constant would else become a bias of the gyro, where the pose graph has gravity against that. mounting_sigma
+    (rad), time_offset_sigma (s): where the pose graph has not refined them. gravity_sigma (rad): of its direction at
+    first, which accelerations hide. velocity_sigma (m/s): at first, when nothing is known of it. stamp_jitter_s: how
+    far a frame's stamp may be from when it was taken.
 
     angular_acceleration (rad/s^2/sqrt(Hz)) and acceleration (m/s^2/sqrt(Hz)): how the motion strays from a constant one
     where no IMU measures it. After max_rejected_in_a_row pairs were rejected the prediction is taken to be wrong
@@ -154,6 +155,7 @@ class EkfConfig(FusionConfig):
 
     accelerometer_noise: PositiveFloat = 1.0
     pair_scale_correlation_s: PositiveFloat = 30.0
+    pair_rate_bias_correlation_s: PositiveFloat = 50.0
     mounting_sigma: PositiveFloat = 6e-3
     time_offset_sigma: PositiveFloat = 5e-3
     gravity_sigma: PositiveFloat = 0.3

@@ -5,12 +5,16 @@ spreads the error; a pair estimate measures the motion from the cloned pose to t
 moved into the nominal state; then the present pose becomes the clone. Everything is causal. Loops and satellite
 positions are not used: they are the pose graph's.
 
-Error state (37): attitude, position, velocity, gyro bias, accelerometer bias, direction of gravity (2), scale error and
-rate bias of the front end (4), mounting, lever arm, time offset and misalignment (10), attitude and position of the
-clone. They are those of the pose graph; what a pair shows of them is in `fusion.pair_model`. Poses are those of the
-IMU, attitudes err on the right, R = R_nominal Exp(error); all else adds. Gravity is Q e3 times its magnitude, so that
-only two errors of the rotation Q are felt. The world is the first camera's frame. Without an IMU its axes are the
-camera's.
+Error state (37): attitude, position, velocity (in the IMU's axes), gyro bias, accelerometer bias, direction of gravity
+(2), scale error and rate bias of the front end (4), mounting, lever arm, time offset and misalignment (10), attitude
+and position of the clone. They are those of the pose graph; what a pair shows of them is in `fusion.pair_model`. Poses
+are those of the IMU, attitudes err on the right, R = R_nominal Exp(error); all else adds. Gravity is Q e3 times its
+magnitude, so that only two errors of the rotation Q are felt. The world is the first camera's frame. Without an IMU its
+axes are the camera's.
+
+The velocity is that in the IMU's own axes, because no pair shows which way the world's are turned: a filter whose
+velocity is the world's takes each correction of it for knowledge of the heading (Bloesch et al., "Iterated extended
+Kalman filter based visual-inertial odometry using direct photometric feedback", 2017, have it so too).
 
 What a filter learns late, of scale or gravity, moves its position by what it got wrong all the way before. A trajectory
 whose past stays where it was must not jump by that: its positions are the sum of the motions as they were known when
@@ -75,11 +79,11 @@ class Measurement(NamedTuple):
 class State:
     """The nominal state.
 
-    R (3, 3), p, v (3,): pose and velocity of the IMU in the world; rate (3,) rad/s: of its turning, in its own axes;
-    gyro_bias (rad/s), accelerometer_bias (m/s^2) (3,) in its axes; Q (3, 3), whose third column points down; front_end
-    (4,): scale error and rate bias (rad/s); T_camera_imu (4, 4); ahead_s: how much further ahead the IMU's clock is
-    than was thought; misalignment (3,) rad; clone (4, 4), clone_twist (6,): pose and twist of the IMU at the last
-    frame.
+    R (3, 3), p (3,): pose of the IMU in the world; v (3,) m/s, rate (3,) rad/s: its velocity, and that of its turning,
+    in its own axes; gyro_bias (rad/s), accelerometer_bias (m/s^2) (3,) in them, too; Q (3, 3), whose third column
+    points down; front_end (4,): scale error and rate bias (rad/s); T_camera_imu (4, 4); ahead_s: how much further ahead
+    the IMU's clock is than was thought; misalignment (3,) rad; clone (4, 4), clone_twist (6,): pose and twist of the
+    IMU at the last frame.
     """
 
     R: FloatArray
@@ -109,7 +113,7 @@ class State:
     @property
     def twist(self) -> FloatArray:
         """(6,) of the IMU in its own axes, rotation first."""
-        return np.concatenate([self.rate, self.R.T @ self.v])
+        return np.concatenate([self.rate, self.v])
 
     def shown(self, seconds: float) -> Prediction:
         """What a pair estimate from the clone to now would show."""
@@ -137,10 +141,11 @@ def log(matrix: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(matrix).as_rotvec())
 
 
-def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
-    """The state after M pieces of IMU, and the Jacobians (M, 37, 37) of its error from piece to piece.
+def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray, FloatArray]:
+    """The state after M pieces of IMU, the Jacobians (M, 37, 37) of its error from piece to piece, and by noise.
 
-    Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it.
+    Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it. The
+    noise of a piece, whose Jacobian (M, 37, 37) is the other, is that of `Filter._spread`.
     """
     dt = window.durations[:, None]
     turns = (window.angular_velocity - state.gyro_bias) * dt
@@ -149,22 +154,32 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray]:
     R = np.stack(list(accumulate(wholes, np.matmul, initial=state.R)))
     R_half = R[:-1] @ halves
     gained = (np.einsum("nij,nj->ni", R_half, forces) + state.gravity) * dt
-    v = state.v + np.cumsum(gained, axis=0)
-    p = state.p + np.sum((v - gained / 2) * dt, axis=0)
+    in_world = state.R @ state.v + np.cumsum(gained, axis=0)
+    p = state.p + np.sum((in_world - gained / 2) * dt, axis=0)
+    v = np.concatenate([state.v[None], np.einsum("nji,nj->ni", R[1:], in_world)])
 
     dt = dt[:, None]
-    by_attitude = -R_half @ skew(forces) * dt
+    unturn, unturn_half = wholes.swapaxes(1, 2), halves.swapaxes(1, 2)
+    by_turn = -right_jacobian(turns) * dt
+    force_by_bias = halves @ skew(forces) @ right_jacobian(turns / 2) * (dt / 2)  # the turn halfway changes with it
     F = np.tile(np.eye(DIMENSION), (len(dt), 1, 1))
-    F[:, ATTITUDE, ATTITUDE] = wholes.swapaxes(1, 2)
-    F[:, ATTITUDE, GYRO_BIAS] = -right_jacobian(turns) * dt
-    F[:, VELOCITY, ATTITUDE] = by_attitude @ halves.swapaxes(1, 2)
-    F[:, VELOCITY, GYRO_BIAS] = -by_attitude @ right_jacobian(turns / 2) * (dt / 2)
-    F[:, VELOCITY, ACCELEROMETER_BIAS] = -R_half * dt
-    F[:, VELOCITY, GRAVITY_DIRECTION] = GRAVITY * state.Q @ TILT * dt
-    F[:, POSITION] += F[:, VELOCITY] * (dt / 2)
-    F[:, POSITION, VELOCITY] = np.eye(3) * dt
+    F[:, ATTITUDE, ATTITUDE] = unturn
+    F[:, ATTITUDE, GYRO_BIAS] = by_turn
+    F[:, VELOCITY, ATTITUDE] = unturn @ skew(R[:-1].swapaxes(1, 2) @ state.gravity) * dt
+    F[:, VELOCITY, VELOCITY] = unturn
+    F[:, VELOCITY, GYRO_BIAS] = skew(v[1:]) @ by_turn + unturn @ force_by_bias * dt
+    F[:, VELOCITY, ACCELEROMETER_BIAS] = -unturn_half * dt
+    F[:, VELOCITY, GRAVITY_DIRECTION] = R[1:].swapaxes(1, 2) @ (GRAVITY * state.Q @ TILT) * dt
+    F[:, POSITION, ATTITUDE] = -R[:-1] @ (skew(v[:-1]) + skew(np.einsum("nij,nj->ni", halves, forces)) * (dt / 2)) * dt
+    F[:, POSITION, VELOCITY] = R[:-1] * dt
+    F[:, POSITION, GYRO_BIAS] = R[:-1] @ force_by_bias * (dt**2 / 2)
+    F[:, POSITION, ACCELEROMETER_BIAS] = -R_half * (dt**2 / 2)
+    F[:, POSITION, GRAVITY_DIRECTION] = GRAVITY * state.Q @ TILT * (dt**2 / 2)
+    by_noise = np.tile(np.eye(DIMENSION), (len(dt), 1, 1))
+    by_noise[:, VELOCITY, ATTITUDE] = skew(v[1:])
+    by_noise[:, POSITION, POSITION] = R[1:]
     rate = window.angular_velocity[-1] - state.gyro_bias
-    return replace(state, R=R[-1], p=p, v=v[-1], rate=rate), F
+    return replace(state, R=R[-1], p=p, v=v[-1], rate=rate), F, by_noise
 
 
 def shown_jacobian(state: State, shown: Prediction) -> FloatArray:
@@ -242,6 +257,7 @@ class Filter:
         ahead_s, misalignment = 0.0, zero
         if mounting is not None:
             T_camera_imu, ahead_s, misalignment = mounting.T_camera_imu, mounting.ahead_s, mounting.misalignment
+            gyro_bias, sigma[GYRO_BIAS] = mounting.gyro_bias, mounting.gyro_bias_std
         self.front_end_sigma = np.repeat(front_end_sigma, [1, 3])
         sigma[FRONT_END] = self.front_end_sigma
         P = np.diag(sigma**2)
@@ -255,7 +271,7 @@ class Filter:
         self.state = State(
             R,
             p,
-            R @ twist[3:],
+            twist[3:],
             twist[:3],
             gyro_bias,
             zero,
@@ -362,16 +378,29 @@ class Filter:
 
     def forget_velocity(self) -> None:
         """Make the velocity as uncertain as at first, and independent of all else."""
-        P = self.kf.P.copy()
-        P[VELOCITY], P[:, VELOCITY] = 0.0, 0.0
-        P[VELOCITY, VELOCITY] = self.config.velocity_sigma**2 * np.eye(3)
-        self.kf.P = P
-        self.trail_cross = self.trail_cross.copy()
-        self.trail_cross[:, VELOCITY] = 0.0
+        self._renew_velocity(self.config.velocity_sigma**2)
+
+    def take_twist(self, measured: Measurement) -> None:
+        """Where no IMU measures it, rate and velocity are those of the step that was measured just now."""
+        seconds = measured.seconds
+        turned = log(self.state.clone[:3, :3].T @ self.state.R)
+        halfway = self.state.R @ exp(-turned / 2)  # a mean velocity is that of the middle
+        velocity = halfway.T @ (self.state.p - self.state.clone[:3, 3]) / seconds
+        self.state = replace(self.state, rate=turned / seconds, v=velocity)
+        variance = measured.covariance[3:, 3:].trace() / 3 / seconds**2 + self.unknown[1] ** 2 * seconds
+        self._renew_velocity(variance)
 
     def doubt_gyro_bias(self, sigma: float) -> None:
         """Make the gyro's bias that much (rad/s) more uncertain: it has stepped."""
         self.kf.P[GYRO_BIAS, GYRO_BIAS] += sigma**2 * np.eye(3)
+
+    def _renew_velocity(self, variance: float) -> None:
+        P = self.kf.P.copy()
+        P[VELOCITY], P[:, VELOCITY] = 0.0, 0.0
+        P[VELOCITY, VELOCITY] = variance * np.eye(3)
+        self.kf.P = P
+        self.trail_cross = self.trail_cross.copy()
+        self.trail_cross[:, VELOCITY] = 0.0
 
     def camera(self) -> tuple[FloatArray, FloatArray]:
         """The pose of the camera (4, 4) on the trail, and its covariance (6, 6), rotation first, right perturbation."""
@@ -390,7 +419,8 @@ class Filter:
         """How the IMU is mounted, as far as it is known by now."""
         state = self.state
         covariance = self.kf.P[MOUNTED, MOUNTED].copy()
-        return Mounting(state.T_camera_imu, state.ahead_s, state.misalignment, covariance)
+        bias, bias_std = state.gyro_bias, self.std(GYRO_BIAS)
+        return Mounting(state.T_camera_imu, state.ahead_s, state.misalignment, covariance, bias, bias_std)
 
     def std(self, part: slice) -> FloatArray:
         """The standard deviations of a part of the error."""
@@ -399,9 +429,9 @@ class Filter:
     def _predict_by_imu(self, window: ImuWindow) -> None:
         if not self.knows_gravity:
             self._look_down(window)
-        self.state, jacobians = propagate(self.state, window)
+        self.state, jacobians, by_noise = propagate(self.state, window)
         variances = np.outer(window.durations, self.imu_walk)
-        self._spread(jacobians, variances, self.config.accelerometer_noise, window.durations)
+        self._spread(jacobians, by_noise, variances, self.config.accelerometer_noise, window.durations)
 
     def _look_down(self, window: ImuWindow) -> None:
         """Take gravity's direction from the first accelerations: an accelerometer at rest shows what holds it up."""
@@ -411,15 +441,19 @@ class Filter:
         self.knows_gravity = True
 
     def _predict_by_constancy(self, seconds: float) -> None:
-        turn = exp(self.state.rate * seconds)
-        self.state = replace(self.state, R=self.state.R @ turn, p=self.state.p + self.state.v * seconds)
-        F = np.eye(DIMENSION)
+        """Rate and velocity stay as they are, in the axes of the IMU: it goes on along an arc."""
+        turn, halfway = exp(self.state.rate * seconds), exp(self.state.rate * seconds / 2)
+        R, v = self.state.R, halfway @ self.state.v
+        self.state = replace(self.state, R=R @ turn, p=self.state.p + R @ v * seconds)
+        F, by_noise = np.eye(DIMENSION), np.eye(DIMENSION)
         F[ATTITUDE, ATTITUDE] = turn.T
-        F[POSITION, VELOCITY] = np.eye(3) * seconds
+        F[POSITION, ATTITUDE] = -R @ skew(v) * seconds
+        F[POSITION, VELOCITY] = R @ halfway * seconds
+        by_noise[POSITION, POSITION] = self.state.R
         variances = seconds * self.imu_walk
         angular_acceleration, acceleration = self.unknown
         variances[ATTITUDE] = angular_acceleration**2 * seconds**3
-        self._spread(F[None], variances[None], acceleration, np.array([seconds]))
+        self._spread(F[None], by_noise[None], variances[None], acceleration, np.array([seconds]))
 
     def _drift(self, seconds: float) -> None:
         """Let the lasting errors of the front end fade and wander: Gauss-Markov processes."""
@@ -428,12 +462,20 @@ class Filter:
         factors, variances = np.ones(DIMENSION), np.zeros(DIMENSION)
         factors[FRONT_END] = keep
         variances[FRONT_END] = (1.0 - keep**2) * self.front_end_sigma**2
-        self._spread(np.diag(factors)[None], variances[None], 0.0, np.array([seconds]))
+        self._spread(np.diag(factors)[None], np.eye(DIMENSION)[None], variances[None], 0.0, np.array([seconds]))
 
-    def _spread(self, jacobians: FloatArray, variances: FloatArray, acceleration: float, seconds: FloatArray) -> None:
+    def _spread(
+        self,
+        jacobians: FloatArray,
+        by_noise: FloatArray,
+        variances: FloatArray,
+        acceleration: float,
+        seconds: FloatArray,
+    ) -> None:
         """Move the covariance on over M pieces that last seconds (M,), with the jacobians (M, 37, 37) of each.
 
-        variances (M, 37) are added, and what a white acceleration of a density in m/s^2/sqrt(Hz) adds.
+        Noise has variances (M, 37), and that of a white acceleration of a density in m/s^2/sqrt(Hz), whose position is
+        in the axes of the IMU, too; by_noise (M, 37, 37): how the error changes with it.
         """
         noise = variances[:, :, None] * np.eye(DIMENSION)
         by_axis = (acceleration**2 * seconds)[:, None, None] * np.eye(3)
@@ -442,6 +484,7 @@ class Filter:
         noise[:, VELOCITY, POSITION] += by_axis * seconds / 2
         noise[:, POSITION, VELOCITY] += by_axis * seconds / 2
         noise[:, POSITION, POSITION] += by_axis * seconds**2 / 3
+        noise = by_noise @ noise @ by_noise.swapaxes(1, 2)
         for self.kf.F, self.kf.Q in zip(jacobians, noise, strict=True):
             self.kf.predict()
             self.trail_cross = self.trail_cross @ self.kf.F.T
@@ -486,7 +529,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
         if stands and used:
             ekf.stand_still()
         if window is None:
-            ekf.state = replace(ekf.state, rate=_rate(ekf.state, pair.seconds))
+            ekf.take_twist(pair)
         ekf.clone()
         rows.append(_row(ekf, innovation, nis, used))
         cameras.append(ekf.camera())
@@ -516,11 +559,6 @@ def _by_stamps(pair: PairEstimate, jitter_s: float) -> FloatArray:
     rates = pair.T_source_target.as_exp_coords() / pair.duration_s
     by_rotation, by_translation = (np.outer(rates[part], rates[part]) for part in (slice(0, 3), slice(3, 6)))
     return np.asarray(2.0 * jitter_s**2 * block_diag(by_rotation, by_translation))
-
-
-def _rate(state: State, seconds: float) -> FloatArray:
-    """The rate (3,) rad/s of the turning since the clone, by which a step without an IMU is predicted to go on."""
-    return log(state.clone[:3, :3].T @ state.R) / seconds
 
 
 def _row(ekf: Filter, innovation: FloatArray, nis: float, used: bool) -> tuple[FloatArray | float | bool, ...]:

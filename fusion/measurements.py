@@ -16,17 +16,20 @@ from fusion_io.records import EstimatorSeries, FloatArray, ImuSeries, PairEstima
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """How an IMU is mounted and what its clock reads, as a back end has refined it.
+    """How an IMU is mounted, what its clock reads and what its gyro shows at rest, as a back end has refined it.
 
     T_camera_imu (4, 4); ahead_s: how much further ahead of the camera's its clock is than the calibration says;
     misalignment (3,) rad: of the front end's rotations against its translations. covariance (10, 10): of the right
-    perturbation of T_camera_imu, rotation first, of ahead_s, and of misalignment.
+    perturbation of T_camera_imu, rotation first, of ahead_s, and of misalignment. gyro_bias, gyro_bias_std (3,) rad/s:
+    at first, in the IMU's axes.
     """
 
     T_camera_imu: FloatArray
     ahead_s: float
     misalignment: FloatArray
     covariance: FloatArray
+    gyro_bias: FloatArray
+    gyro_bias_std: FloatArray
 
     @property
     def rotation_imu_camera(self) -> Rotation:

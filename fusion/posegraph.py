@@ -500,14 +500,21 @@ def series_of(problem: Problem, solution: Solution, pairs: PairFactors) -> Estim
 
 
 def _mounting(problem: Problem, solution: Solution) -> Mounting | None:
-    """E(0), with its covariance about the mounting that it leads to."""
+    """E(0), with its covariance about the mounting that it leads to, and the gyro's bias at first."""
     if problem.twists is None:
         return None
     strayed = solution.values.atVector(E(0))
     J = np.eye(10)
     J[:7, :7] = by_vector(strayed)
     T_camera_imu = extrinsics(problem.T_camera_imu, strayed)
-    return Mounting(T_camera_imu, float(strayed[6]), strayed[7:], J @ solution.covariances[E(0)] @ J.T)
+    return Mounting(
+        T_camera_imu,
+        float(strayed[6]),
+        strayed[7:],
+        J @ solution.covariances[E(0)] @ J.T,
+        solution.values.atConstantBias(B(0)).gyroscope(),
+        np.sqrt(np.diag(solution.covariances[B(0)])[3:]),
+    )
 
 
 def _std_at(problem: Problem, solution: Solution, symbol: Callable[[int], int]) -> FloatArray:

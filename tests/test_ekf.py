@@ -114,7 +114,7 @@ def test_the_jacobian_of_the_prediction_equals_finite_differences(pieces: int) -
     """Of biases and gravity too; over one piece, and over several whose Jacobians multiply."""
     rng = np.random.default_rng(pieces)
     state, window = _random_state(rng), _random_window(rng, pieces)
-    moved, jacobians = propagate(state, window)
+    moved, jacobians, _ = propagate(state, window)
     product = np.linalg.multi_dot([np.eye(DIMENSION), *jacobians[::-1], np.eye(DIMENSION)])
     for k, direction in enumerate(STEP * np.eye(DIMENSION)):
         ends = [propagate(inject(state, sign * direction), window)[0] for sign in (1, -1)]
@@ -133,6 +133,26 @@ def test_the_jacobian_of_the_measurement_equals_finite_differences(seed: int) ->
         ends = [inject(state, sign * direction).shown(0.4).motion for sign in (1, -1)]
         numeric = (difference(shown.motion, ends[0]) - difference(shown.motion, ends[1]))[0] / (2 * STEP)
         assert_allclose(H[:, k], numeric, atol=1e-7 if k not in range(*ekf.TIME_OFFSET.indices(99)) else 1e-5)
+
+
+def _turn_of_the_world(state: State) -> FloatArray:
+    """(37, 3): the errors that turn everything about the axes of the world."""
+    errors = np.zeros((DIMENSION, 3))
+    errors[ekf.ATTITUDE], errors[ekf.POSITION] = state.R.T, -ekf.skew(state.p)
+    errors[ekf.GRAVITY_DIRECTION] = state.Q.T[:2]
+    errors[ekf.CLONE_ATTITUDE], errors[ekf.CLONE_POSITION] = state.clone[:3, :3].T, -ekf.skew(state.clone[:3, 3])
+    return errors
+
+
+@pytest.mark.parametrize("velocity", [0.0, 10.0])
+def test_no_measurement_feels_a_turn_of_the_world(velocity: float) -> None:
+    """Neither prediction nor pair, and what is felt does not depend on the velocity, which updates change."""
+    rng = np.random.default_rng(5)
+    state = replace(_random_state(rng), v=velocity * rng.normal(size=3))
+    moved, (jacobian,), _ = propagate(state, _random_window(rng, 1))
+    assert_allclose(jacobian @ _turn_of_the_world(state), _turn_of_the_world(moved), atol=1e-12)
+    assert_allclose(shown_jacobian(moved, moved.shown(0.1)) @ _turn_of_the_world(moved), 0.0, atol=1e-10)
+    assert not np.any(_turn_of_the_world(state)[ekf.VELOCITY])
 
 
 @pytest.mark.parametrize("size", [0.2, 1e-5])
@@ -190,6 +210,11 @@ class WithTrail(Filter):
         self.joint = reset @ (left @ self.joint @ left.T + gain @ self.noise @ gain.T) @ reset.T
         super()._move_error(H)
 
+    def _renew_velocity(self, variance: float) -> None:
+        self.joint[ekf.VELOCITY], self.joint[:, ekf.VELOCITY] = 0.0, 0.0
+        self.joint[ekf.VELOCITY, ekf.VELOCITY] = variance * np.eye(3)
+        super()._renew_velocity(variance)
+
     def clone(self) -> None:
         copy = np.eye(40)
         copy[37:, ekf.POSITION] += np.eye(3)
@@ -221,7 +246,7 @@ def test_where_the_first_camera_is_the_world_it_is_so_for_any_mounting() -> None
     """Its pose and the covariance of it are zero, whatever strays: F, the clock, both."""
     rng = np.random.default_rng(0)
     root = 0.1 * rng.normal(size=(10, 10))
-    mounting = Mounting(_transform(rng), 0.05, 0.1 * rng.normal(size=3), root @ root.T)
+    mounting = Mounting(_transform(rng), 0.05, 0.1 * rng.normal(size=3), root @ root.T, np.zeros(3), np.ones(3))
     for filter_ in (_filter(), _filter(mounting)):
         pose, covariance = filter_.camera()
         assert_allclose(pose, np.eye(4), atol=1e-12)
@@ -271,9 +296,13 @@ def test_covariances_are_covariances(with_imu: bool) -> None:
 def test_doubt_about_the_mounting_shows_in_the_trajectory_and_certainty_stays() -> None:
     """A mounting that a back end has refined is where the filter begins, with its covariance."""
     drive = _drive()
+    assert drive.measurements.calibration is not None
 
     def filtered(sigma: float) -> Estimate:
-        mounting = Mounting(drive.T_camera_imu, drive.ahead_s, drive.misalignment, sigma**2 * np.eye(10))
+        covariance, bias = sigma**2 * np.eye(10), drive.measurements.calibration.gyro_bias
+        mounting = Mounting(
+            drive.T_camera_imu, drive.ahead_s, drive.misalignment, covariance, bias, np.full(3, EKF.gyro_bias_sigma)
+        )
         return ekf.solve(replace(drive.measurements, mounting=mounting), EKF)
 
     sure, doubtful = filtered(1e-7), filtered(0.02)
@@ -299,7 +328,7 @@ def test_the_prediction_is_dead_reckoning() -> None:
     start = replace(_filter().state, R=np.eye(3), p=np.zeros(3), v=v, gyro_bias=np.zeros(3), Q=down)
     for pieces in (250, 500, 1000):
         angle = rate * pieces / 100
-        end, _ = propagate(start, ImuWindow(*(values[:pieces] for values in window)))
+        end, *_ = propagate(start, ImuWindow(*(values[:pieces] for values in window)))
         assert_allclose(end.R, Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix(), atol=1e-12)
         assert_allclose(end.p, radius * np.array([1 - np.cos(angle), 0.0, np.sin(angle)]), atol=1e-3)
 
