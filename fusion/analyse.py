@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+from fusion_io.command import STANDARD_OUTPUT, answered, role_and_topic, write_json, write_text
+from fusion_io.errors import EXIT_DAMAGED, EXIT_OK
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,21 +17,17 @@ if TYPE_CHECKING:
     from fusion.analysis import Analysis
     from fusion.analysis_tables import PlainTable
 
-STDOUT = "-"
+WIDTH = 100  # where nobody watches
 STYLES = {"ready": "bold green", "usable with limits": "bold yellow", "not usable": "bold red"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = parser().parse_args(argv)
-    try:
-        return run(arguments.log, dict(arguments.topic or ()), arguments.json, arguments.html)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+    return answered(lambda: run(arguments.log, dict(arguments.topic or ()), arguments.json, arguments.html))
 
 
-def run(log_path: Path, topics: dict[str, str], json_path: str | None, html_path: Path | None) -> int:
+def run(log_path: Path, topics: dict[str, str], json_path: Path | None, html_path: Path | None) -> int:
     """Analyse one log, print or write what was found; returns the exit code.
 
     Raises LogError for a file that is no log or cannot be read, or an output that cannot be written.
@@ -39,16 +35,13 @@ def run(log_path: Path, topics: dict[str, str], json_path: str | None, html_path
     from fusion.analysis import analyse, document
 
     analysis = analyse(log_path, topics)
-    text = json.dumps(document(analysis), indent=2, allow_nan=False) + "\n"
     if html_path is not None:
         from fusion.analysis_page import page
 
-        _write(html_path, page(analysis))
-    if json_path == STDOUT:
-        sys.stdout.write(text)
-    else:
-        if json_path is not None:
-            _write(Path(json_path), text)
+        write_text(html_path, page(analysis))
+    if json_path is not None:
+        write_json(json_path, document(analysis))
+    if json_path != STANDARD_OUTPUT:
         _print(analysis)
     return EXIT_DAMAGED if analysis.damaged else EXIT_OK
 
@@ -60,7 +53,7 @@ def _print(analysis: Analysis) -> None:
 
     from fusion.analysis_tables import tables
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
     path = analysis.found.path
     console.print(Text(f"{path.name}: {analysis.answer}", style=STYLES[analysis.answer]))
     for reason in analysis.reasons:
@@ -87,14 +80,6 @@ def _print_table(console: Console, table: PlainTable) -> None:
     console.print(drawn)
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written: {error.strerror or error}") from None
-
-
 def parser() -> argparse.ArgumentParser:
     """The options of the command."""
     parser = argparse.ArgumentParser(
@@ -103,23 +88,18 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit codes: 0 analysed, whatever the verdict; 1 nothing could be read, 2 usage, 3 the log is damaged.",
     )
     parser.add_argument("log", type=Path, metavar="LOG.mcap", help="any MCAP file, an input or an output")
-    parser.add_argument("--json", metavar="OUT", help="write all of it as JSON; - prints it instead of the tables")
+    parser.add_argument(
+        "--json", type=Path, metavar="OUT", help="write all of it as JSON; - prints it instead of the tables"
+    )
     parser.add_argument("--html", type=Path, metavar="OUT", help="write it as one page that needs nothing else")
     parser.add_argument(
         "--topic",
-        type=_role_and_topic,
+        type=role_and_topic,
         action="append",
         metavar="ROLE=NAME",
         help="the topic of a role where the log leaves it open, as for fusion.run; may be repeated",
     )
     return parser
-
-
-def _role_and_topic(text: str) -> tuple[str, str]:
-    role, equals, topic = text.partition("=")
-    if not (role and equals and topic):
-        raise argparse.ArgumentTypeError(f"{text!r} is not ROLE=NAME such as imu=/imu/data")
-    return role, topic
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import NoReturn
 
-from fusion_io.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, UsageError
+from fusion_io.command import answered
+from fusion_io.errors import EXIT_OK, UsageError
 
 COMMANDS = {
     "run": ("fusion.run", "a log in, absolute trajectories out"),
@@ -19,6 +20,7 @@ COMMANDS = {
     "analyse": ("fusion.analyse", "what is in a log, and whether it is good enough to run"),
     "compare": ("fusion.compare", "runs and trajectory files beside each other"),
     "replay": ("fusion.replay", "run the back ends again on what a run recorded, with other settings"),
+    "paper": ("fusion.paper", "the paper's tables and figures from runs with ground truth"),
     "export": ("fusion.export", "time series as CSV or Parquet, everything as a rerun recording"),
     "train": ("learned.train", "train the network"),
     "adapt": ("learned.adapt", "adapt the network to the images of a log, without ground truth"),
@@ -32,26 +34,20 @@ SHELLS = ("bash", "zsh", "tcsh")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code of the command."""
     name, *arguments = (sys.argv[1:] if argv is None else argv) or ["--help"]
-    try:
-        if name in {"-h", "--help"}:
-            print(help_text())
-        elif name == "--version":
-            print(f"violearner-fusion {version('violearner-fusion')}")
-        elif name == "completion":
-            print(completion(arguments))
-        else:
-            return run_command(name, arguments)
-    except UsageError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    return EXIT_OK
+    return answered(lambda: run_command(name, arguments))
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Run a command; raises UsageError, with the nearest name, where there is none of this name."""
+    if name in {"-h", "--help"}:
+        print(help_text())
+        return EXIT_OK
+    if name == "--version":
+        print(f"violearner-fusion {version('violearner-fusion')}")
+        return EXIT_OK
+    if name == "completion":
+        print(completion(arguments))
+        return EXIT_OK
     if name not in COMMANDS:
         near = get_close_matches(name, [*COMMANDS, "completion"], n=1, cutoff=0.0)
         raise UsageError(f"there is no command {name!r}; did you mean {near[0]!r}? See violearner --help")

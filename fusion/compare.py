@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
-from fusion_io.errors import (
-    EXIT_DAMAGED,
-    EXIT_DIFFERS,
-    EXIT_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_OK,
-    EXIT_USAGE,
-    FusionError,
-    LogError,
-    UsageError,
-)
+from fusion_io.command import STANDARD_OUTPUT, answered, write_json, write_text
+from fusion_io.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,7 +21,6 @@ if TYPE_CHECKING:
 
 # Modules that bring numpy are imported by the function that needs them, so that --help answers at once.
 
-STANDARD_OUTPUT = Path("-")
 WIDTH = 100  # where nobody watches
 SAME_PERCENT = 0.005  # less is not seen in the table
 
@@ -53,14 +42,7 @@ _COLUMNS = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        return run(arguments)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    return answered(lambda: run(arguments))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -78,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.html is not None:
         from fusion.comparison_page import page
 
-        write(arguments.html, page(compared))
+        write_text(arguments.html, page(compared))
     met = [condition.text for condition in parsed if condition.holds(compared.measures)]
     if arguments.json is not None:
         write_json(arguments.json, comparison.document(compared) | {"met": met})
@@ -175,24 +157,6 @@ def where(duel: Duel) -> str:
     ]
     ahead = f"{duel.b.name} has less translation error than {duel.a.name} on {better} of {len(stretches)} stretches"
     return f"{ahead}; {', '.join(places)}"
-
-
-def write(path: Path, text: str) -> None:
-    """Write a text file; raises LogError where that is impossible."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LogError(f"{path}: {error.strerror}") from None
-
-
-def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Write a JSON file, or print it where the path is `-`."""
-    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
-    if path == STANDARD_OUTPUT:
-        sys.stdout.write(text)
-    else:
-        write(path, text)
 
 
 def _table(title: str) -> Table:

@@ -16,7 +16,8 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+from fusion_io.command import answered
+from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,17 +43,22 @@ class Exports:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = parser().parse_args(argv)
-    try:
-        from fusion_io.reader import open_log
+    exports = Exports(arguments.csv, arguments.parquet, arguments.rerun)
+    return answered(lambda: run(arguments.log, arguments.images, exports))
 
-        exports = checked(Exports(arguments.csv, arguments.parquet, arguments.rerun))
-        if exports == Exports():
-            raise UsageError("nothing to export to: give --csv, --parquet or --rerun")
-        log = open_log(arguments.log)
-        export(log, open_log(arguments.images) if arguments.images else log, exports)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+
+def run(path: Path, images: Path | None, exports: Exports) -> int:
+    """Export one log, its images from another where that is given; returns the exit code.
+
+    Raises UsageError for nothing to export to, and LogError for a log that cannot be read or a place to write to.
+    """
+    from fusion_io.reader import open_log
+
+    if exports == Exports():
+        raise UsageError("nothing to export to: give --csv, --parquet or --rerun")
+    checked(exports)
+    log = open_log(path)
+    export(log, open_log(images) if images else log, exports)
     for note in log.notes:
         print(f"warning: {note}", file=sys.stderr)
     return EXIT_DAMAGED if log.damaged else EXIT_OK

@@ -18,17 +18,9 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from fusion.compare import label_list, length_list, write
-from fusion_io.errors import (
-    EXIT_DAMAGED,
-    EXIT_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_OK,
-    EXIT_USAGE,
-    FusionError,
-    LogError,
-    UsageError,
-)
+from fusion.compare import label_list, length_list
+from fusion_io.command import answered, write_text
+from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,14 +59,7 @@ class Table(NamedTuple):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        return run(arguments)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    return answered(lambda: run(arguments))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -92,8 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
     print("\n".join(table.markdown() for table in tables.values()), end="")
     if arguments.out is not None:
         for name, table in tables.items():
-            write(arguments.out / f"{name}.md", table.markdown())
-            write(arguments.out / f"{name}.csv", table.csv())
+            write_text(arguments.out / f"{name}.md", table.markdown())
+            write_text(arguments.out / f"{name}.csv", table.csv())
         for result in results:
             save(trajectories_figure(result), arguments.out / f"trajectories-{result.key}.png")
             save(quartile_figure(result, lengths), arguments.out / f"quartiles-{result.key}.png")

@@ -13,16 +13,8 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from fusion_io.errors import (
-    EXIT_DAMAGED,
-    EXIT_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_OK,
-    EXIT_USAGE,
-    FusionError,
-    LogError,
-    UsageError,
-)
+from fusion_io.command import STANDARD_OUTPUT, answered, write_json, write_text
+from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -68,14 +60,7 @@ class Replay:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        return run(arguments)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    return answered(lambda: run(arguments))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -106,10 +91,10 @@ def run(arguments: argparse.Namespace) -> int:
     order, measure = ranked(compared, arguments.sort_by, combinations)
     best = compared[order[0]]
     if arguments.json is not None:
-        compare.write_json(arguments.json, document(log, replays, compared, order, measure))
+        write_json(arguments.json, document(log, replays, compared, order, measure))
     if arguments.out is not None:
         write_folder(arguments.out, replays[order[0]], best)
-    stream = sys.stderr if arguments.json == compare.STANDARD_OUTPUT else sys.stdout
+    stream = sys.stderr if arguments.json == STANDARD_OUTPUT else sys.stdout
     if len(replays) > 1:
         _print(sweep_table(replays, compared, order, measure), stream)
     print(f"{replays[order[0]].label}, compared with the recorded run:", file=stream)
@@ -334,13 +319,12 @@ def document(
 
 def write_folder(folder: Path, best: Replay, compared: Comparison) -> None:
     """Write the trajectories of a replay as NAME.tum and NAME.kitti.txt, its configuration, and the comparison."""
-    from fusion.compare import write
     from fusion.comparison_page import page
     from fusion.config import to_toml
     from fusion_io.trajectory_files import write_kitti, write_tum
 
-    write(folder / "config.toml", to_toml(best.config))
-    write(folder / "comparison.html", page(compared))
+    write_text(folder / "config.toml", to_toml(best.config))
+    write_text(folder / "comparison.html", page(compared))
     for name, trajectory in best.trajectories.items():
         write_tum(folder / f"{name}.tum", trajectory)
         write_kitti(folder / f"{name}.kitti.txt", trajectory)

@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from fusion.export import Exports, add_options, checked, export
 from fusion_io import progress
-from fusion_io.errors import (
-    EXIT_DAMAGED,
-    EXIT_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_OK,
-    EXIT_USAGE,
-    FusionError,
-    LogError,
-    UsageError,
-)
+from fusion_io.command import STANDARD_OUTPUT, answered, role_and_topic, write_text
+from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, LogError
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -35,7 +27,6 @@ if TYPE_CHECKING:
 
 # Modules that bring numpy, torch or GTSAM are imported by the function that needs them, so that --help answers at once.
 
-STANDARD_OUTPUT = Path("-")
 INTERRUPTED = "interrupted"
 ADAPTED = "adapted.pt"
 
@@ -53,18 +44,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
     progress.silence(arguments.quiet)
-    try:
-        from fusion import config
+    return answered(lambda: _run(arguments), ": nothing to show for it")
 
-        exports = checked(Exports(arguments.csv, arguments.parquet, arguments.rerun))
-        presentation = Presentation(arguments.quiet, arguments.json, exports)
-        return run(arguments.log, arguments.out, config.load(arguments.config, _overrides(arguments)), presentation)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted: nothing to show for it", file=sys.stderr)
-        return EXIT_INTERRUPTED
+
+def _run(arguments: argparse.Namespace) -> int:
+    from fusion import config
+
+    exports = checked(Exports(arguments.csv, arguments.parquet, arguments.rerun))
+    presentation = Presentation(arguments.quiet, arguments.json, exports)
+    return run(arguments.log, arguments.out, config.load(arguments.config, _overrides(arguments)), presentation)
 
 
 def run(log_path: Path, out: Path | None, config: RunConfig, presentation: Presentation = Presentation()) -> int:
@@ -93,7 +81,7 @@ def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentatio
     findings = Findings()
     stopwatch.lap("read")
 
-    pairs = pair_estimates(log, samples, config.frontend, findings, folder)
+    pairs, levels = pair_estimates(log, samples, config.frontend, findings, folder)
     stopwatch.lap("pairs")
 
     calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
@@ -136,6 +124,7 @@ def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentatio
         known.loops,
         fixes,
         known.skips,
+        levels,
     )
     output.write_log(folder, outcome)
     output.write_text(folder, outcome)
@@ -152,15 +141,16 @@ def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentatio
 
 def pair_estimates(
     log: Log, imu: ImuSeries, config: FrontendConfig, findings: Findings, folder: Path
-) -> list[PairEstimate]:
+) -> tuple[list[PairEstimate], list[PairEstimate]]:
     """The recorded pair estimates of the log or those of the network, as they read back from their message.
 
+    Beside them, what the network made of the pairs level by level, where it is known (`learned.estimator.by_level`).
     Passing the network's estimates through their message makes a replay of the output start from the same bits.
     A network that is adapted to the log first is left in the folder. Raises LogError where there are none.
     """
     if config.mode == "recorded" or (config.mode == "auto" and log.has_pairs):
         if recorded := log.pairs():
-            return recorded
+            return recorded, log.levels()
         raise LogError(f"{log.path}: no recorded pair estimates that can be used")
     if not log.has_frames:
         raise LogError(f"{log.path}: no images to estimate pairs from; it has {', '.join(log.roles)}")
@@ -169,10 +159,11 @@ def pair_estimates(
 
     weights = adapted_weights(log, config, folder) if config.adapt else config.weights
     pairs: list[PairEstimate] = []
+    levels: list[PairEstimate] = []
     skipped: Counter[str] = Counter()
     frames = progress.track(log.frames(), "pair estimates", len(log.frame_stamps()))
     try:
-        for pair in estimate_pairs(log, imu, weights, frames, skipped, config.refine):
+        for pair in estimate_pairs(log, imu, weights, frames, skipped, config.refine, levels):
             pairs.append(decode_pair(encode_pair(pair)))
     except KeyboardInterrupt:
         if not pairs:
@@ -186,7 +177,7 @@ def pair_estimates(
     if not pairs:
         reasons = "; ".join(findings.notes) or f"it has {len(log.frame_stamps())} frames"
         raise LogError(f"{log.path}: no pair of frames could be estimated ({reasons})")
-    return pairs
+    return pairs, levels[: len(pairs)]  # one may have been under way when it was interrupted
 
 
 def skipping_pairs(
@@ -268,24 +259,12 @@ def present(folder: Path, outcome: Outcome, presentation: Presentation) -> None:
     if not presentation.quiet:
         print_results(folder, outcome, sys.stderr if presentation.json == STANDARD_OUTPUT else sys.stdout)
     if presentation.json is not None:
-        copy_metrics(folder, presentation.json)
+        write_text(presentation.json, (folder / "metrics.json").read_text(encoding="utf-8"))
     if presentation.exports != Exports():
         from fusion.output import LOG_NAME
         from fusion_io.reader import open_log
 
         export(open_log(folder / LOG_NAME), outcome.log, presentation.exports)
-
-
-def copy_metrics(folder: Path, destination: Path) -> None:
-    """Copy metrics.json to a file or to stdout."""
-    text = (folder / "metrics.json").read_text(encoding="utf-8")
-    if destination == STANDARD_OUTPUT:
-        sys.stdout.write(text)
-        return
-    try:
-        destination.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LogError(f"{destination}: {error.strerror}") from None
 
 
 def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
@@ -300,7 +279,8 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
     print_table(Console(file=stream), title, outcome.trajectories, metrics)
     for remark in (*log.remarks, *outcome.findings.remarks):
         print(remark, file=stream)
-    print(f"IMU {'used' if calibration.used else 'left out'}: {calibration.reason}", file=stream)
+    refused = "calibrated, but no back end used it" if calibration.used else "left out"
+    print(f"IMU {'used' if outcome.imu_used else refused}: {calibration.reason}", file=stream)
     for name, estimate in outcome.estimates.items():
         print(f"{HEADINGS[name]}: {estimate.note}", file=stream)
     print(f"Results: {folder}", file=stream)
@@ -391,7 +371,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--topic",
-        type=_role_and_topic,
+        type=role_and_topic,
         action="append",
         metavar="ROLE=NAME",
         help="the topic of a role where the log leaves it open; roles: image, depth, camera_info, imu, gyro, "
@@ -408,13 +388,6 @@ def _lengths(text: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of lengths such as 10,20,30") from None
-
-
-def _role_and_topic(text: str) -> tuple[str, str]:
-    role, equals, topic = text.partition("=")
-    if not (role and equals and topic):
-        raise argparse.ArgumentTypeError(f"{text!r} is not ROLE=NAME such as imu=/imu/data")
-    return role, topic
 
 
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:

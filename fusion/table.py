@@ -17,6 +17,8 @@ Metrics = Mapping[str, float | int | None]
 
 HEADINGS = {"raw": "raw", "posegraph": "pose graph", "posegraph_online": "online", "ekf": "EKF"}
 
+WIDTH_OF_NUMBER = 9
+
 
 @dataclass(frozen=True)
 class _Row:
@@ -56,8 +58,8 @@ def print_table(
         if any(value is not None for value in values):
             table.add_row(row.label, Text(row.unit), *_cells(row, values))
     table.add_section()
-    table.add_row("path length", "m", *(_number(each.path_length_m, 1) for each in trajectories.values()))
-    table.add_row("stated 1-sigma at the end", "m", *(_final_sigma(each) for each in trajectories.values()))
+    table.add_row("path length", "m", *(number(each.path_length_m, 1) for each in trajectories.values()))
+    table.add_row("stated 1-sigma at the end", "m", *(final_sigma(each) for each in trajectories.values()))
     console.print(Text(title))
     console.print(table)
     console.print(Text(_legend(metrics)))
@@ -69,14 +71,15 @@ def _cells(row: _Row, values: Sequence[float | int | None]) -> list[Text]:
     return [
         Text("-")
         if value is None
-        else Text(_number(value * row.scale, row.decimals), style="bold" if abs(value - row.right) == best else "")
+        else Text(number(value * row.scale, row.decimals), style="bold" if abs(value - row.right) == best else "")
         for value in values
     ]
 
 
-def _number(value: float, decimals: int) -> str:
+def number(value: float, decimals: int) -> str:
     """A number of at most nine characters, so that even a diverged result leaves the table in shape."""
-    return f"{value:.{decimals}f}" if abs(value) < 1e4 else f"{value:.2e}"
+    text = f"{value:.{decimals}f}"
+    return text if len(text) <= WIDTH_OF_NUMBER else f"{value:.2e}"
 
 
 def _legend(metrics: Mapping[str, Metrics]) -> str:
@@ -87,8 +90,8 @@ def _legend(metrics: Mapping[str, Metrics]) -> str:
     return "Lower is better; an ANEES above 3 is overconfident."
 
 
-def _final_sigma(trajectory: Trajectory) -> str:
+def final_sigma(trajectory: Trajectory) -> str:
     """Root of the summed variances of the last position, as the back end states it."""
     if trajectory.covariances is None:
         return "-"
-    return _number(float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:]))), 2)
+    return number(float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:]))), 2)

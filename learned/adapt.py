@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, FusionError, LogError
+from fusion_io.command import answered
+from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError
 from learned.train import positive_integer
 
 if TYPE_CHECKING:
@@ -86,19 +87,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=positive_integer, help="threads (default: torch's)")
     options = parser.parse_args(arguments)
 
+    return answered(lambda: run(options))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Adapt to a log and say what it was good for; returns the exit code."""
     from fusion_io.reader import open_log
 
-    try:
-        if options.threads:
-            import torch
+    if options.threads:
+        import torch
 
-            torch.set_num_threads(options.threads)
-        log = open_log(options.log)
-        adapted = adapt(log, options.weights, options.out, Adaptation(steps=options.steps))
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_FAILED
-    print(adapted)
+        torch.set_num_threads(options.threads)
+    log = open_log(options.log)
+    print(adapt(log, options.weights, options.out, Adaptation(steps=options.steps)))
     return EXIT_DAMAGED if log.damaged else EXIT_OK
 
 

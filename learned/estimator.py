@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.records import CameraFrame, FloatArray, ImuSeries, IntArray, PairEstimate
 from learned import weights as weights_file
@@ -81,18 +81,34 @@ def estimate_pairs(
     progress: Iterable[CameraFrame] | None = None,
     skipped: Counter[str] | None = None,
     refined: bool = True,
+    levels: list[PairEstimate] | None = None,
 ) -> Iterator[PairEstimate]:
     """Pair estimates of the consecutive frames of a log, streamed.
 
     imu: the log's IMU on its own clock (possibly empty). weights: None for those that ship with the package.
     progress: `log.frames()` wrapped in a progress display. skipped: counts the pairs that could not be estimated, as
     "pairs_over_missing_frames" and "pairs_without_depth", and those that were but not refined, as
-    "pairs_not_refined". Raises LogError for unusable weights or logs.
+    "pairs_not_refined". levels: gets the motion after each level of the network, as `by_level`. Raises LogError for
+    unusable weights or logs.
     """
     frames = log.frames() if progress is None else iter(progress)
     skipped = Counter() if skipped is None else skipped
     for inference in infer(weights_file.load(weights), frames, log.frame_stamps(), imu, skipped, refined):
+        if levels is not None:
+            levels.append(by_level(inference))
         yield inference.pair
+
+
+def by_level(inference: Inference) -> PairEstimate:
+    """The estimate of the network alone, whose hypotheses are the motions after each of its levels."""
+    motions = RigidTransform.from_matrix(inference.levels)
+    return replace(
+        inference.network,
+        winner=-1,
+        hypotheses_quat_wxyz=motions.rotation.as_quat(scalar_first=True),
+        hypotheses_translation=motions.translation,
+        errors=np.zeros(0),
+    )
 
 
 def estimate_skips(

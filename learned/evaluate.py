@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
-from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+from fusion_io.command import STANDARD_OUTPUT, answered, write_json
+from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--log", type=Path, required=True, metavar="FILE.mcap", help="a log with images, depth and ground truth"
     )
     parser.add_argument("--weights", type=Path, metavar="FILE", help="the network's weights (default: those shipped)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures; - is stdout")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="draw them into this folder")
     parser.add_argument(
         "--baselines",
@@ -53,28 +53,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="also run classical RGB-D odometry on the same pairs, and time it beside the network",
     )
     options = parser.parse_args(arguments)
-    try:
-        prepare_outputs(options.json, options.plots)
-        evaluation = evaluate(options.log, options.weights, options.baselines)
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
+    return answered(lambda: run(options))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Evaluate, show and write what was asked for; returns the exit code."""
+    prepare_outputs(options.json, options.plots)
+    evaluation = evaluate(options.log, options.weights, options.baselines)
     for note in evaluation.notes:
         print(f"warning: {note}", file=sys.stderr)
     if options.json is not None:
-        options.json.write_text(json.dumps(evaluation.figures, indent=2, allow_nan=False) + "\n")
+        write_json(options.json, evaluation.figures)
     if options.plots is not None:
         from learned.plots import write_plots
 
         write_plots(options.plots, evaluation.comparison, options.log.name)
-    show(evaluation.figures, options.log.name)
+    show(evaluation.figures, options.log.name, sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout)
     return EXIT_DAMAGED if evaluation.damaged else EXIT_OK
 
 
 def prepare_outputs(figures: Path | None, plots: Path | None) -> None:
     """Make sure, before time is spent, that results can be written; raises UsageError otherwise."""
     try:
-        if figures is not None:
+        if figures is not None and figures != STANDARD_OUTPUT:
             figures.parent.mkdir(parents=True, exist_ok=True)
             existed = figures.exists()
             figures.open("a").close()
@@ -214,11 +215,11 @@ def sentences(path: Path, skipped: Mapping[str, int]) -> Iterator[str]:
             yield f"{path}: {SENTENCES[name].format(pairs)}"
 
 
-def show(figures: Mapping[str, Any], log_name: str) -> None:
+def show(figures: Mapping[str, Any], log_name: str, stream: TextIO) -> None:
     """Print errors and consistency as tables."""
     from rich.console import Console
 
-    console = Console(width=None if sys.stdout.isatty() else 100)
+    console = Console(file=stream, width=None if stream.isatty() else 100)
     console.print(error_table(figures, log_name))
     if "threads" in figures:
         console.print(baseline_table(figures))

@@ -18,15 +18,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fusion_io.errors import EXIT_FAILED, EXIT_OK, EXIT_USAGE, FusionError, LogError, UsageError
+from fusion_io.command import answered
+from fusion_io.errors import EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
     from learned.dataset import PairSet
     from learned.optimisation import Descent
     from learned.violearner import VIOLearner
     from learned.weights import Weights
-
-EXIT_INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
 
 @dataclass(frozen=True)
@@ -134,18 +133,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     changes = {"steps": options.steps, "batch": options.batch, "calibration_clips": options.calibration_clips}
     changes["refined_calibration_clips"] = options.calibration_clips
     recipe = replace(RECIPES[options.preset], **{name: value for name, value in changes.items() if value})
-    try:
+
+    def job() -> int:
         train(
             options.preset, recipe, options.out, options.seed, options.workers, options.threads, options.device,
             options.data or (Source(),), options.precision,
         )  # fmt: skip
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED
-    except KeyboardInterrupt as interruption:
-        print(f"{str(interruption) or 'interrupted'}; run the same command again to go on", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    return EXIT_OK
+        return EXIT_OK
+
+    return answered(job, "; run the same command again to go on")
 
 
 def train(

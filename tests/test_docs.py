@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 import yaml
-from test_interop import drive
+from drive_samples import without_pictures, write_drive
 
 from fusion import cli, export, run
 from fusion.config import RunConfig
-from fusion_io.writer import LogWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -87,16 +86,10 @@ def test_every_page_is_in_the_navigation_once() -> None:
 def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as the pages assume it: drive.mcap, its run in runs/drive, and tables of that."""
     folder = tmp_path_factory.mktemp("docs")
-    truth, pairs, imu = drive()
-    with LogWriter(folder / "drive.mcap") as log:
-        log.imu(imu)
-        log.ground_truth(truth)
-        log.pairs(pairs)
-    with pytest.MonkeyPatch.context() as patch:
-        for pictures in ("write_plots", "write_report"):
-            patch.setattr(f"fusion.output.{pictures}", lambda *_: None)
-        exports = run.Presentation(quiet=True, exports=export.Exports(csv=folder / "tables"))
-        assert run.run(folder / "drive.mcap", folder / "runs" / "drive", RunConfig(), exports) == 0
+    log = write_drive(folder / "drive.mcap")
+    exports = run.Presentation(quiet=True, exports=export.Exports(csv=folder / "tables"))
+    with without_pictures():
+        assert run.run(log, folder / "runs" / "drive", RunConfig(), exports) == 0
     return folder
 
 

@@ -166,3 +166,13 @@ def test_frames_made_ahead_come_in_order_and_an_error_among_them_is_raised() -> 
 @pytest.mark.parametrize("count", [0, 1])
 def test_fewer_than_two_frames_give_no_pairs(weights_path: Path, count: int) -> None:
     assert estimate(Frames(frames(count)), weights_path)[0] == []
+
+
+def test_levels_are_those_of_the_pairs_and_the_last_is_the_network_s_own(weights_path: Path) -> None:
+    levels: list[PairEstimate] = []
+    pairs = list(estimate_pairs(Frames(frames(4)), NO_IMU, weights_path, refined=False, levels=levels))
+    assert len(levels) == len(pairs) == 3
+    for pair, each in zip(pairs, levels, strict=True):
+        assert (each.source_stamp_ns, each.target_stamp_ns) == (pair.source_stamp_ns, pair.target_stamp_ns)
+        assert each.hypotheses_quat_wxyz.shape == (5, 4)
+        np.testing.assert_allclose(each.hypotheses_translation[-1], pair.translation, atol=1e-6)

@@ -13,6 +13,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from drive_samples import FRAMES, drive, without_pictures, write_drive
 from log_samples import frames, pair_estimates
 from mcap.reader import make_reader
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -23,12 +24,10 @@ from fusion.config import RunConfig
 from fusion_io import messages, topics
 from fusion_io.errors import UsageError
 from fusion_io.reader import Log, open_log
-from fusion_io.records import ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import PairEstimate, Trajectory
 from fusion_io.writer import LogWriter
 
 ROOT = Path(__file__).resolve().parents[1]
-SECOND = 1_000_000_000
-FRAMES = 40
 
 NAMES = ("raw", "posegraph", "ekf")
 
@@ -41,43 +40,13 @@ def command(name: str) -> Path:
     return path
 
 
-def drive() -> tuple[Trajectory, list[PairEstimate], ImuSeries]:
-    """A left turn of 40 frames, pair estimates of it with noise, and samples of a gyro."""
-    rng = np.random.default_rng(0)
-    step = RigidTransform.from_components([0.0, 0.0, 1.0], Rotation.from_rotvec([0.0, -0.02, 0.0]))
-    poses = [RigidTransform.identity()]
-    for _ in range(FRAMES - 1):
-        poses.append(poses[-1] * step)
-    stamps = 1_300_000_000 * SECOND + np.arange(FRAMES) * 100_000_000
-    sigma = np.array([1e-3, 1e-3, 1e-3, 0.03, 0.03, 0.03])
-    pairs = []
-    for source, target in zip(stamps[:-1].tolist(), stamps[1:].tolist(), strict=True):
-        motion = step * RigidTransform.from_exp_coords(rng.normal(size=6) * sigma)
-        quat_wxyz = motion.rotation.as_quat(scalar_first=True)
-        pairs.append(PairEstimate(source, target, quat_wxyz, motion.translation, np.diag(sigma**2)))
-    truth = Trajectory(stamps, RigidTransform.concatenate(poses))
-    samples = np.arange(stamps[0], stamps[-1], 10_000_000)
-    gyro = np.tile([0.0, -0.2, 0.0], (len(samples), 1)) + rng.normal(size=(len(samples), 3)) * 1e-3
-    acceleration = np.tile([2.0, -9.81, 0.0], (len(samples), 1)) + rng.normal(size=(len(samples), 3)) * 1e-2
-    return truth, pairs, ImuSeries(samples, gyro, acceleration)
-
-
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run with images in its log."""
     folder = tmp_path_factory.mktemp("interop")
-    truth, pairs, imu = drive()
-    with LogWriter(folder / "in.mcap") as log:
-        log.imu(imu)
-        log.ground_truth(truth)
-        log.pairs(pairs)
-        for stamp, frame in zip(truth.stamps_ns.tolist(), frames(FRAMES), strict=True):
-            log.image(stamp, frame.image)
-            log.camera_info(stamp, frame.camera)
-    with pytest.MonkeyPatch.context() as patch:
-        for pictures in ("write_plots", "write_report"):
-            patch.setattr(f"fusion.output.{pictures}", lambda *_: None)
-        assert run.run(folder / "in.mcap", folder / "out", RunConfig(record="all")) == 0
+    log = write_drive(folder / "in.mcap", images=True)
+    with without_pictures():
+        assert run.run(log, folder / "out", RunConfig(record="all")) == 0
     return folder / "out"
 
 

@@ -1,5 +1,6 @@
 """Every trajectory of a log is found, ours and those of others; what is not a pose is left out and counted."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from fusion_io import messages
 from fusion_io.errors import LogError
 from fusion_io.messages import PoseSample
 from fusion_io.odometry import name_of, only_trajectory, read_trajectories
+from fusion_io.reader import open_log
 from fusion_io.records import Trajectory
 from fusion_io.writer import LogWriter
 
@@ -83,6 +85,19 @@ def test_topics_whose_names_are_the_same_lose_nothing(tmp_path: Path) -> None:
         tmp_path / "log.mcap", [_odometry(topic, START + k, _pose(k)) for topic in topics for k in range(2)]
     )
     assert len(read_trajectories(path).trajectories) == 2
+
+
+def test_a_covariance_that_is_not_finite_is_none_and_costs_no_pose(tmp_path: Path) -> None:
+    """As both readers have it: poses by themselves, and those of a log with roles."""
+    covariance = 0.01 * np.eye(6)
+    poses = [replace(_pose(k), covariance=np.full((6, 6), np.nan) if k == 1 else covariance) for k in range(3)]
+    odometry = [_odometry("/odometry/ekf", START + k * SECOND, pose) for k, pose in enumerate(poses)]
+    truth = ("/ground_truth", messages.POSE_STAMPED, START, messages.encode_pose(START, _pose(0)))
+    path = write_raw(tmp_path / "log.mcap", [*odometry, truth])
+    for found in (read_trajectories(path).trajectories["ekf"], open_log(path).trajectory("ekf")):
+        assert found is not None
+        assert found.covariances is not None
+        assert_allclose(found.covariances, np.stack([covariance, np.zeros((6, 6)), covariance]), atol=1e-12)
 
 
 def test_bad_poses_are_left_out_and_counted(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, FusionError, UsageError
+from fusion_io.command import answered
+from fusion_io.errors import EXIT_OK, UsageError
 
 if TYPE_CHECKING:
     from fusion_io.front_end_noise import FrontEndNoise
@@ -32,18 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     args = _parser(argv).parse_args(argv)
-    try:
-        exit_code: int = args.run(args)
-        return exit_code
-    except UsageError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    except FusionError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_FAILED
-    except KeyboardInterrupt:
-        print("interrupted: nothing was written", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    return answered(lambda: args.run(args), ": nothing was written")
 
 
 # ------------------------------------------------------------------------------------------------- arguments

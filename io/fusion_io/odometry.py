@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion_io import encodings, messages, topics
+from fusion_io import encodings, messages, poses, topics
 from fusion_io.container import Channel, Contents, MessageFile
 from fusion_io.errors import LogError
-from fusion_io.inertial import longest_increasing
-from fusion_io.messages import PoseSample
 from fusion_io.records import Trajectory
 from fusion_io.recovery import scan
 
 POSE_TYPES = (messages.ODOMETRY, messages.POSE_STAMPED, messages.POSE_WITH_COVARIANCE)
-UNIT_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +46,7 @@ def read_trajectories(path: Path) -> RecordedTrajectories:
     channels = {channel.topic: channel for channel in contents.counts if _is_trajectory(channel)}
     found: dict[str, Trajectory] = {}
     for topic in sorted(contents.index, key=_order):
-        samples, left_out = _samples(path, contents, channels[topic])
-        trajectory = _trajectory(samples)
-        left_out += len(samples) - len(trajectory)
+        trajectory, left_out = _read(path, contents, channels[topic])
         if left_out:
             notes.append(f"{path}: {topic}: {left_out} poses are left out: unreadable, invalid or out of order")
         if len(trajectory) > 1:
@@ -82,44 +77,18 @@ def _is_trajectory(channel: Channel) -> bool:
     return encodings.ros2_type(channel) in POSE_TYPES
 
 
-def _samples(path: Path, contents: Contents, channel: Channel) -> tuple[list[tuple[int, PoseSample]], int]:
-    """Stamps (the log time where there is none) and poses in order of recording, and how many are no poses."""
-    samples, invalid = [], 0
+def _read(path: Path, contents: Contents, channel: Channel) -> tuple[Trajectory, int]:
+    """The trajectory on a channel (at log times where there are no stamps), and how many messages are left out."""
     message_type = encodings.ros2_type(channel)
+    samples = []
     with MessageFile(path, contents.blocks) as file:
         index = encodings.stamped(file, encodings.in_cdr(contents, channel))
         stamps_ns = np.where(index.stamps_ns == 0, index.log_times_ns, index.stamps_ns)
         for i, stamp_ns in enumerate(stamps_ns.tolist()):
-            try:
-                pose = messages.decode_pose(message_type, file.read(index, i))
-            except ValueError:
-                invalid += 1
-                continue
-            if _is_valid(pose):
-                samples.append((stamp_ns, pose))
-            else:
-                invalid += 1
-    return samples, invalid
-
-
-def _is_valid(pose: PoseSample) -> bool:
-    unit = abs(float(np.linalg.norm(pose.quat_wxyz)) - 1.0) < UNIT_TOLERANCE
-    known = pose.covariance is None or bool(np.all(np.isfinite(pose.covariance)))
-    return unit and known and bool(np.all(np.isfinite(pose.position)))
-
-
-def _trajectory(samples: list[tuple[int, PoseSample]]) -> Trajectory:
-    """The longest run of samples in order of time; with covariances where one of them states any."""
-    stamps_ns = np.array([stamp_ns for stamp_ns, _ in samples], dtype=np.int64)
-    kept = longest_increasing(stamps_ns)
-    poses = [samples[i][1] for i in kept.tolist()]
-    positions = np.array([pose.position for pose in poses]).reshape(-1, 3)
-    quats = np.array([pose.quat_wxyz for pose in poses]).reshape(-1, 4)
-    covariances = None
-    if any(pose.covariance is not None for pose in poses):  # the first pose may well state zero: it is the world
-        covariances = np.stack([np.zeros((6, 6)) if pose.covariance is None else pose.covariance for pose in poses])
-    rotations = Rotation.from_quat(quats, scalar_first=True)
-    return Trajectory(stamps_ns[kept], RigidTransform.from_components(positions, rotations), covariances)
+            with contextlib.suppress(ValueError):
+                samples.append((stamp_ns, messages.decode_pose(message_type, file.read(index, i))))
+    trajectory, _, _ = poses.in_order(samples)
+    return trajectory, len(stamps_ns) - len(trajectory)
 
 
 def only_trajectory(path: Path, recorded: RecordedTrajectories) -> Trajectory:

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from fusion_io import camera, encodings, inertial, messages, mounting, roles, topics
+from fusion_io import camera, encodings, inertial, messages, mounting, poses, roles, topics
 from fusion_io.container import Channel, Contents, MessageFile, MessageIndex
 from fusion_io.errors import LogError
 from fusion_io.findings import Findings
@@ -39,9 +38,7 @@ _TIMED_ROLES = ("image", "camera_info", "pairs", "imu", "gyro", "ground_truth", 
 _OTHER_CLOCK_S = 60.0
 _TRIED_MESSAGES = 10
 _LISTED_TOPICS = 8
-_UNIT_TOLERANCE = 0.01
 _ASYMMETRY = 1e-6
-_FARTHEST_M = 1e9  # nothing on Earth is as far away, and the square of more may not be finite
 
 _T = TypeVar("_T")
 
@@ -275,26 +272,11 @@ class Log:
 
     def _poses(self, role: str) -> Trajectory | None:
         """The valid poses of a role or topic in order of time; covariances are zero where only others have one."""
-        message_type = self._type(role)
-        recorded, columns = array("q"), array("d")
-        for stamp, pose in self._decoded(role, lambda data: messages.decode_pose(message_type, data)):
-            recorded.append(stamp)
-            columns.extend(pose.position)
-            columns.extend(pose.quat_wxyz)
-            columns.extend(_NO_COVARIANCE if pose.covariance is None else pose.covariance.ravel())
-        stamps, poses = np.array(recorded, dtype=np.int64), np.array(columns).reshape(-1, 43)
-        valid = np.all(np.abs(poses[:, :3]) < _FARTHEST_M, axis=1) & _is_unit(poses[:, 3:7])
-        self._report(f"{role}_invalid", role, stamps[~valid], "without a valid pose are left out")
-        stamps, poses = self._increasing(role, stamps[valid], poses[valid])
-        if not len(stamps):
-            return None
-        rotations = Rotation.from_quat(poses[:, 3:7], scalar_first=True)
-        covariances = poses[:, 7:].reshape(-1, 6, 6)
-        return Trajectory(
-            stamps,
-            RigidTransform.from_components(poses[:, :3], rotations),
-            covariances if covariances.any() else None,
-        )
+        decode = functools.partial(messages.decode_pose, self._type(role))
+        trajectory, invalid, late = poses.in_order(self._decoded(role, decode))
+        self._report(f"{role}_invalid", role, invalid, "without a valid pose are left out")
+        self._report_late(role, late)
+        return trajectory if len(trajectory) else None
 
     def pairs(self) -> list[PairEstimate]:
         """Recorded pair estimates in order of time, to the bit as they were written; invalid ones are left out."""
@@ -307,6 +289,10 @@ class Log:
     def loops(self) -> list[PairEstimate]:
         """Recorded loop closures in order of time; invalid ones are left out."""
         return self._pair_estimates("loops")
+
+    def levels(self) -> list[PairEstimate]:
+        """Recorded pairs whose hypotheses are the motions after each level of the network, in order of time."""
+        return self._pair_estimates("levels")
 
     def _pair_estimates(self, role: str) -> list[PairEstimate]:
         if role not in self.roles:
@@ -401,8 +387,7 @@ class Log:
     def _increasing(self, role: str, stamps: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
         """The longest strictly increasing run of stamps, with its values."""
         kept = inertial.longest_increasing(stamps)
-        left_out = np.delete(stamps, kept)
-        self._report(f"{role}_backward", role, left_out, "that go back in time or repeat a stamp are left out")
+        self._report_late(role, np.delete(stamps, kept))
         return stamps[kept], values[kept]
 
     def _frame_id(self, *among: str) -> str:
@@ -472,6 +457,9 @@ class Log:
         first = f", the first at {_seconds(stamps[0])}" if len(stamps) else ""
         self._findings.put(name, len(stamps), f"{self._named(role)}: {len(stamps)} messages {what}{first}")
 
+    def _report_late(self, role: str, stamps: IntArray) -> None:
+        self._report(f"{role}_backward", role, stamps, "that go back in time or repeat a stamp are left out")
+
     def _report_unreadable(self, role: str, unreadable: list[tuple[int, ValueError]]) -> None:
         if self._topic(role) in self._types:
             stamps = np.array([stamp for stamp, _ in unreadable], dtype=np.int64)
@@ -510,7 +498,6 @@ class Log:
 
 
 _MISSING = (np.nan, np.nan, np.nan)
-_NO_COVARIANCE = (0.0,) * 36
 
 
 def _readable(channel: Channel) -> bool:
@@ -535,11 +522,6 @@ def _typical(deviations: FloatArray) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def _is_unit(quats_wxyz: FloatArray) -> NDArray[np.bool_]:
-    unit: NDArray[np.bool_] = np.abs(np.linalg.norm(quats_wxyz, axis=-1) - 1) < _UNIT_TOLERANCE
-    return unit
-
-
 def _is_valid(pair: PairEstimate) -> bool:
     """Whether a pair estimate can be used: times, a rotation, a covariance that can be inverted."""
     hypotheses = len(pair.hypotheses_translation)
@@ -553,8 +535,8 @@ def _is_valid(pair: PairEstimate) -> bool:
     return (
         pair.source_stamp_ns < pair.target_stamp_ns
         and all(bool(np.all(np.isfinite(values))) for values in numbers)
-        and bool(_is_unit(pair.quat_wxyz))
-        and bool(np.abs(pair.translation).max() < _FARTHEST_M)
+        and bool(poses.is_unit(pair.quat_wxyz))
+        and bool(np.abs(pair.translation).max() < poses.FARTHEST_M)
         and -1 <= pair.winner < max(hypotheses, 1)
         and bool(np.abs(pair.covariance - pair.covariance.T).max() <= _ASYMMETRY * np.abs(pair.covariance).max())
         and bool(np.linalg.eigvalsh(pair.covariance)[0] > 0)

@@ -198,6 +198,11 @@ class EstimatorSeries:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    @property
+    def knows_imu(self) -> bool:
+        """Whether it tells anything of an IMU."""
+        return bool(np.any(np.isfinite(self.gyro_bias)))
+
     @classmethod
     def joined(cls, parts: Sequence[EstimatorSeries]) -> EstimatorSeries:
         """One series of the rows of at least one."""

@@ -21,6 +21,7 @@ CANONICAL = {
     "pairs": topics.PAIRS,
     "skips": topics.SKIPS,
     "loops": topics.LOOPS,
+    "levels": topics.LEVELS,
     "gnss": topics.GNSS,
     "tf_static": topics.TF_STATIC,
 }
@@ -38,13 +39,14 @@ _READABLE = {
     "pairs": {messages.PAIR_ESTIMATE},
     "skips": {messages.PAIR_ESTIMATE},
     "loops": {messages.PAIR_ESTIMATE},
+    "levels": {messages.PAIR_ESTIMATE},
     "gnss": {messages.GNSS},
     "tf_static": {messages.TRANSFORMS},
 }
 READABLE_TYPES = frozenset({messages.ESTIMATOR_STATE}).union(*_READABLE.values())
 
-_NOT_PAIRS = {topics.SKIPS, topics.LOOPS}
-_ONLY_BY_NAME = {"skips", "loops", "tf_static"}
+_NOT_PAIRS = {topics.SKIPS, topics.LOOPS, topics.LEVELS}
+_ONLY_BY_NAME = {"skips", "loops", "levels", "tf_static"}
 _INERTIAL = ("imu", "gyro", "accelerometer")
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from mcap.records import Schema
@@ -18,6 +19,8 @@ from fusion_io.records import FloatArray, IntArray
 
 _TRIED_MESSAGES = 10
 _HEADERS = {"std_msgs/Header", "std_msgs/msg/Header", "Header"}
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,34 +105,25 @@ class Survey:
 
     def images(self, topic: str, count: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Stamps and images of about so many messages spread evenly over a topic; unreadable ones are left out."""
-        message_type = encodings.ros2_type(self.channels[topic])
-        for stamp, data in self._sampled(topic, count):
-            try:
-                image = messages.decode_image(message_type, data)
-            except ValueError:
-                continue
-            yield stamp, image
+        yield from self._sampled(topic, count, messages.decode_image)
 
     def depths(self, topic: str, count: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """Stamps and depth, in metres and 0 where there is none, as ``images``."""
-        message_type = encodings.ros2_type(self.channels[topic])
-        for stamp, data in self._sampled(topic, count):
-            try:
-                depth = messages.decode_depth(message_type, data)
-            except ValueError:
-                continue
-            yield stamp, depth
+        yield from self._sampled(topic, count, messages.decode_depth)
 
-    def _sampled(self, topic: str, count: int) -> Iterator[tuple[int, bytes | memoryview]]:
+    def _sampled(
+        self, topic: str, count: int, decode: Callable[[str, bytes | memoryview], _T]
+    ) -> Iterator[tuple[int, _T]]:
+        message_type = encodings.ros2_type(self.channels[topic])
         index, stamps = self._indices[topic], self.stamps(topic)
         chosen = np.unique(np.linspace(0, len(index) - 1, min(count, len(index))).astype(int))
         with self._open() as file:
             for i in chosen.tolist():
                 try:
-                    data = file.read(index, i)
+                    decoded = decode(message_type, file.read(index, i))
                 except ValueError:
                     continue
-                yield int(stamps[i]), data
+                yield int(stamps[i]), decoded
 
     def _indexed(self, channel: Channel) -> MessageIndex:
         if encodings.ros2_type(channel) not in roles.READABLE_TYPES:

@@ -13,6 +13,7 @@ GNSS = "/gnss"
 PAIRS = "/violearner/pairs"
 SKIPS = "/violearner/skips"
 LOOPS = "/violearner/loops"
+LEVELS = "/violearner/levels"
 TF = "/tf"
 TF_STATIC = "/tf_static"
 ODOMETRY_PREFIX = "/odometry/"
@@ -31,6 +32,7 @@ _MESSAGE_TYPES = {
     PAIRS: messages.PAIR_ESTIMATE,
     SKIPS: messages.PAIR_ESTIMATE,
     LOOPS: messages.PAIR_ESTIMATE,
+    LEVELS: messages.PAIR_ESTIMATE,
     TF: messages.TRANSFORMS,
     TF_STATIC: messages.TRANSFORMS,
 }

@@ -200,6 +200,10 @@ class LogWriter:
         """Loop closures, in order of their target stamps."""
         self._add_pairs(topics.LOOPS, list(loops))
 
+    def levels(self, pairs: Iterable[PairEstimate]) -> None:
+        """Pairs whose hypotheses are the motions after each level of the network, in order of their target stamps."""
+        self._add_pairs(topics.LEVELS, list(pairs))
+
     def gnss(self, fix: GnssFix) -> None:
         """One position fix."""
         self._add_series(topics.GNSS, iter([(fix.stamp_ns, messages.encode_gnss(fix))]))

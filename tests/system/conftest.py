@@ -1,11 +1,12 @@
 """A simulated drive as a log of any kind, for tests of whole commands."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from drive_samples import without_pictures
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, FloatArray, ImuSeries, PairEstimate, Trajectory
@@ -84,10 +85,10 @@ def simulated_drive() -> Callable[..., Drive]:
 
 
 @pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs in this process draw nothing, which takes most of a small run's time; the pictures have their own tests."""
-    monkeypatch.setattr("fusion.output.write_plots", lambda folder, outcome: None)
-    monkeypatch.setattr("fusion.output.write_report", lambda folder, outcome: None)
+def no_pictures() -> Iterator[None]:
+    """Runs in this process draw nothing."""
+    with without_pictures():
+        yield
 
 
 @pytest.fixture(scope="session")

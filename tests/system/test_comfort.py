@@ -84,23 +84,20 @@ def interrupt_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return install
 
 
-def images_only(drive: Any, path: Path, weights: Path) -> list[str]:
+@pytest.fixture
+def images_only(drive: Any, tmp_path: Path, small_weights: Path) -> list[str]:
     """The command line of a run that estimates pairs, without refinement."""
-    drive.write(path / "in.mcap", leave_out=["pairs"])
-    options = ["--out", str(path / "out"), "--weights", str(weights), "--no-refine", "--record", "all"]
-    return ["--log", str(path / "in.mcap"), *options]
+    drive.write(tmp_path / "in.mcap", leave_out=["pairs"])
+    options = ["--out", str(tmp_path / "out"), "--weights", str(small_weights), "--no-refine", "--record", "all"]
+    return ["--log", str(tmp_path / "in.mcap"), *options]
 
 
 def test_ctrl_c_leaves_a_valid_result_of_the_pairs_until_then(
-    drive: Any,
-    tmp_path: Path,
-    small_weights: Path,
-    interrupt_after: Callable[[int], None],
-    capsys: pytest.CaptureFixture[str],
+    images_only: list[str], tmp_path: Path, interrupt_after: Callable[[int], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exit code 130, all files, trajectories and run.mcap that end where the pairs end, and a replay of the same."""
     interrupt_after(12)
-    assert run.main(images_only(drive, tmp_path, small_weights)) == 130
+    assert run.main(images_only) == 130
     assert "warning: interrupted: results are of the first 1.2 s only" in capsys.readouterr().err
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["log"]["warnings"]["interrupted"] == 1
@@ -111,18 +108,15 @@ def test_ctrl_c_leaves_a_valid_result_of_the_pairs_until_then(
     assert not partial.damaged
     assert len(partial.frame_stamps()) == 13
     assert len(list(partial.frames())) == 13
+    assert [len(each.hypotheses_translation) for each in partial.levels()] == 12 * [5]
     assert run.main(["--log", str(tmp_path / "out" / "run.mcap"), "--out", str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "raw.tum").read_bytes() == (tmp_path / "out" / "raw.tum").read_bytes()
 
 
 def test_ctrl_c_before_the_first_pair_leaves_no_result(
-    drive: Any,
-    tmp_path: Path,
-    small_weights: Path,
-    interrupt_after: Callable[[int], None],
-    capsys: pytest.CaptureFixture[str],
+    images_only: list[str], tmp_path: Path, interrupt_after: Callable[[int], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     interrupt_after(0)
-    assert run.main(images_only(drive, tmp_path, small_weights)) == 130
+    assert run.main(images_only) == 130
     assert capsys.readouterr().err == "interrupted: nothing to show for it\n"
     assert not (tmp_path / "out").exists()

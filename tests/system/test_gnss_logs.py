@@ -10,6 +10,7 @@ import numpy as np
 import pymap3d
 import pytest
 from conftest import Drive
+from drive_samples import without_pictures
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -46,9 +47,7 @@ def write(path: Path, drive: Drive, fixes: list[GnssFix]) -> Path:
 @pytest.fixture(scope="module")
 def quick() -> Iterator[None]:
     """Nothing is drawn: that takes most of a small run's time, and has its own tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        for pictures in ("write_plots", "write_report"):
-            patch.setattr(f"fusion.output.{pictures}", lambda *_: None)
+    with without_pictures():
         yield
 
 
