@@ -21,6 +21,17 @@ from fusion_io.records import NANOSECONDS
 
 # Okabe and Ito's palette, which the colour-blind tell apart.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+EVENT_COLOURS = {
+    events.IMU_GAP: "#56b4e9",
+    events.STUCK: "#cc79a7",
+    events.SATURATED: "#f0e442",
+    events.CLOCK_JUMP: "#8c5a2b",
+    events.DROPPED_FRAMES: "#0072b2",
+    events.MISSING_PAIRS: "#8c8c8c",
+    events.WRONG_PAIR: "#e69f00",
+    events.CONTRADICTION: "#d55e00",
+    events.STAND_STILL: "#009e73",
+}
 # Lines and letters take the colour of the page's text: a drawing has this one, which is replaced.
 INK = "#010203"
 DRAWING: dict[Any, Any] = {
@@ -43,7 +54,9 @@ h1 { font-size: 1.4rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
 table { border-collapse: collapse; } .wide { overflow-x: auto; }
 th, td { padding: .2rem .6rem; border-bottom: 1px solid light-dark(#ddd, #444); text-align: left; vertical-align: top; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
-svg { max-width: 100%; height: auto; }
+.wide svg { width: 100%; min-width: 44rem; height: auto; }
+@media (max-width: 700px) {
+  body { margin-top: 1rem; font-size: 14px; } th, td { padding: .2rem .35rem; } ul { padding-left: 1.2rem; } }
 @media print { body { margin: 0; max-width: none; } }
 """
 
@@ -58,7 +71,10 @@ def page(analysis: Analysis) -> str:
         for reason in analysis.reasons
     )
     with mpl.rc_context(DRAWING):
-        drawings = "".join(f"<h2>{html.escape(title)}</h2>{_svg(figure)}" for title, figure in _figures(analysis))
+        drawings = "".join(
+            f'<h2>{html.escape(title)}</h2><div class="wide">{_svg(figure)}</div>'
+            for title, figure in _figures(analysis)
+        )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -109,12 +125,11 @@ def _timeline(analysis: Analysis) -> Figure:
     rows = {topic: row for row, topic in enumerate(drawn)}
     for topic, each in drawn.items():
         span = [_recorded_s(each, at_ns) - start_s for at_ns in (each.start_ns, each.end_ns)]
-        axes.plot(span, 2 * [rows[topic]], color=COLOURS[0], linewidth=4, marker="|", solid_capstyle="butt")
-    kinds = {kind: COLOURS[1 + i % (len(COLOURS) - 1)] for i, kind in enumerate((*events.FAULTS, events.STAND_STILL))}
-    for event in analysis.found.events:
+        axes.plot(span, 2 * [rows[topic]], color=INK, linewidth=2, marker="|", solid_capstyle="butt")
+    for event in sorted(analysis.found.events, key=lambda event: -event.duration_s):  # the shortest on top
         if event.topic in rows:
             span = [_recorded_s(drawn[event.topic], at_ns) - start_s for at_ns in (event.start_ns, event.end_ns)]
-            at, colour = 2 * [rows[event.topic]], kinds[event.kind]
+            at, colour = 2 * [rows[event.topic]], EVENT_COLOURS[event.kind]
             axes.plot(span, at, color=colour, linewidth=10, solid_capstyle="projecting", label=event.kind)
     axes.set_yticks(range(len(drawn)), list(drawn))
     axes.set_ylim(len(drawn) - 0.5, -0.5)

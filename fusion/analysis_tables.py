@@ -106,11 +106,11 @@ def _imus(analysis: Analysis) -> Iterator[PlainTable]:
 def _events(analysis: Analysis) -> PlainTable:
     found = analysis.found.events
     rows = [
-        (event.kind, event.topic, event.text, f"{event.start_ns / NANOSECONDS:.3f}", f"{event.duration_s:.2f}")
+        (f"{event.start_ns / NANOSECONDS:.3f}", f"{event.duration_s:.2f}", event.kind, event.topic, event.text)
         for event in found[:LISTED_EVENTS]
     ]
     title = "Events" if len(found) <= LISTED_EVENTS else f"Events (the first {LISTED_EVENTS} of {len(found)})"
-    return PlainTable(title, ("kind", "topic", "what", "at s", "for s"), rows, 3)
+    return PlainTable(title, ("at s", "for s", "kind", "topic", "what"), rows, 5)
 
 
 def _results(analysis: Analysis) -> PlainTable:

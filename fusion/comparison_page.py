@@ -44,6 +44,11 @@ th:first-child, td:first-child, td.word { text-align: left; }
 td.best { font-weight: 700; } .better { color: var(--good); } .worse { color: var(--bad); }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); gap: 1rem; }
 .plots > div { min-width: 0; height: 27rem; }
+@media (max-width: 700px) {
+  body { font-size: 14px; padding: .75rem; } th, td { padding: .25rem .4rem; } .key { display: none; }
+  .scroll th:first-child, .scroll td:first-child {
+    position: sticky; left: 0; background: var(--paper); white-space: normal; min-width: 8rem; }
+  .whole > div { height: 34rem; } }
 @media print { .plots { display: block; } .plots > div { break-inside: avoid; } }
 """
 
@@ -99,9 +104,9 @@ def _measures(comparison: Comparison) -> Iterator[str]:
         for each in contestants(result):
             values = asdict(comparison.metrics[each.name])
             cells = [_cell(comparison, row.key, values[row.key], row.scale, row.decimals) for row in known]
-            rows.append(f"<tr><td>{escape(label(each))}</td><td class=word>{each.name}</td>{''.join(cells)}</tr>")
+            rows.append(f"<tr><td>{escape(label(each))}</td><td class='word key'>{each.name}</td>{''.join(cells)}</tr>")
     heads = "".join(f"<th>{escape(row.label)}<br>{escape(row.unit)}</th>" for row in known)
-    yield _table(f"<th></th><th></th>{heads}", rows)
+    yield _table(f"<th></th><th class=key></th>{heads}", rows)
     if not known:
         yield "<p>There is no ground truth, so nothing says which of them is better.</p>"
 
@@ -200,7 +205,7 @@ def _whole(comparison: Comparison) -> Iterator[str]:
     above.update_yaxes(scaleanchor="x")
     boxes.update_layout(boxmode="group")
     boxes.update_xaxes(type="category")
-    yield f"<h2>All</h2><div class=plots>{_html(above, 'from-above')}{_html(boxes, 'by-length')}</div>"
+    yield f'<h2>All</h2><div class="plots whole">{_html(above, "from-above")}{_html(boxes, "by-length")}</div>'
 
 
 def _quartiles(estimate: Trajectory, truth: Trajectory, lengths: Sequence[float], name: str, i: int) -> go.Box:
@@ -318,7 +323,7 @@ def _figure(title: str, x: str, y: str) -> go.Figure:
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "margin": {"l": 60, "r": 15, "t": 45, "b": 50},
-        "legend": {"orientation": "h", "y": -0.18},
+        "legend": {"orientation": "h", "yref": "container", "y": 0.0, "yanchor": "bottom"},
     }
     return go.Figure(layout=layout)
 

@@ -101,11 +101,16 @@ def dropped_frames(stamps_ns: IntArray, topic: str) -> list[Event]:
 
 
 def missing_pairs(frame_stamps_ns: IntArray, pairs: Sequence[PairEstimate], topic: str) -> list[Event]:
-    """Where frames (N,) follow each other and no pair leads across; nothing where there are no pairs at all."""
+    """Where frames (N,) follow each other and no pair leads across; nothing where there are no pairs at all.
+
+    Where only the pairs tell when there were frames (N = 0), those that are missing from their rhythm.
+    """
     if not pairs:
         return []
     frames = np.asarray(frame_stamps_ns)
     spans = np.array([(pair.source_stamp_ns, pair.target_stamp_ns) for pair in pairs], dtype=np.int64).reshape(-1, 2)
+    if not len(frames):
+        return dropped_frames(np.unique(spans), topic)
     # How many pairs cover each interval between frames: +1 where a pair starts, -1 where it ends.
     cover = np.zeros(len(frames) + 1, dtype=np.int64)
     np.add.at(cover, np.searchsorted(frames, spans[:, 0], side="right") - 1, 1)

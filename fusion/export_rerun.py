@@ -8,7 +8,6 @@ https://rerun.io/docs/concepts/entity-component.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle
 from pathlib import Path
 
 import cv2
@@ -27,8 +26,15 @@ JPEG_QUALITY = 85
 FRUSTUM_M = 2.0
 
 # Okabe and Ito's palette, which the colour-blind can tell apart: https://jfly.uni-koeln.de/color/.
-COLOURS = {"ground_truth": (0, 158, 115), "raw": (140, 140, 140), "posegraph": (0, 114, 178), "ekf": (213, 94, 0)}
-OTHER_COLOURS = ((204, 121, 167), (86, 180, 233), (230, 159, 0))
+COLOURS = {
+    "ground_truth": (0, 158, 115),
+    "raw": (140, 140, 140),
+    "posegraph": (0, 114, 178),
+    "posegraph_online": (86, 180, 233),
+    "ekf": (213, 94, 0),
+    "ekf_smoothed": (230, 159, 0),
+}
+OTHER_COLOUR = (204, 121, 167)
 LOOP_COLOUR = (240, 228, 66)
 
 # The trajectory that carries the images: the first of these that there is.
@@ -50,8 +56,8 @@ def write_rerun(path: Path, log: Log, images: Log) -> None:
     truth = log.ground_truth()
     if truth is not None:
         _log_trajectory(recording, "ground_truth", _in_world_of(trajectories, truth), COLOURS["ground_truth"])
-    for (name, each), other in zip(trajectories.items(), cycle(OTHER_COLOURS), strict=False):
-        _log_trajectory(recording, name, each, COLOURS.get(name, other))
+    for name, each in trajectories.items():
+        _log_trajectory(recording, name, each, COLOURS.get(name, OTHER_COLOUR))
         _log_estimates(recording, log, name, each, truth)
     _log_sensors(recording, log)
     if carrier is not None:

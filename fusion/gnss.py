@@ -64,6 +64,15 @@ class Positions:
 
 
 @dataclass(frozen=True, slots=True)
+class PlacedFixes:
+    """Fixes in the world of a trajectory: stamps_ns (N,), places_m (N, 3), and used (N,), which were believed."""
+
+    stamps_ns: IntArray
+    places_m: FloatArray
+    used: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
 class Georeference:
     """Where on the earth a world is.
 
@@ -83,6 +92,12 @@ class Georeference:
     def of(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory of the camera in the local frame; without covariances, which would need those of both."""
         return Trajectory(trajectory.stamps_ns, RigidTransform.from_matrix(self.T_enu_world) * trajectory.poses)
+
+    def in_world(self, known: Positions, stamps_ns: IntArray) -> PlacedFixes:
+        """The positions of the antenna that were measured during a trajectory with these stamps, in its world."""
+        during, _, _ = _between(stamps_ns, known.stamps_ns)
+        places_m = RigidTransform.from_matrix(self.T_enu_world).inv().apply(known.enu_m[during])
+        return PlacedFixes(known.stamps_ns[during], places_m, self.used)
 
 
 def positions(fixes: Sequence[GnssFix], config: GnssConfig, findings: Findings) -> Positions | None:

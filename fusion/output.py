@@ -47,7 +47,8 @@ PACKAGES = ("violearner-fusion", "numpy", "scipy", "torch", "gtsam", "filterpy",
 class Outcome:
     """All that a run read and computed; trajectories and metrics by name: raw, posegraph, ekf.
 
-    estimates: all that the back ends found, by the same names.
+    estimates: all that the back ends found, by the same names. levels: what the network made of the pairs level by
+    level, as hypotheses.
     """
 
     log: Log
@@ -63,11 +64,17 @@ class Outcome:
     loops: Sequence[PairEstimate] = ()
     gnss: Sequence[GnssFix] = ()
     skips: Sequence[PairEstimate] = ()
+    levels: Sequence[PairEstimate] = ()
 
     @property
     def mounting(self) -> Mounting | None:
         """How the IMU is mounted, as a back end has refined it, or None."""
         return next((each.mounting for each in self.estimates.values() if each.mounting is not None), None)
+
+    @property
+    def imu_used(self) -> bool:
+        """Whether a back end used the IMU: one may refuse it although it could be calibrated."""
+        return any(each.series is not None and each.series.knows_imu for each in self.estimates.values())
 
     @property
     def duration_s(self) -> float:
@@ -121,6 +128,7 @@ def write_log(folder: Path, outcome: Outcome) -> None:
         writer.pairs(outcome.pairs)
         writer.skips(outcome.skips)
         writer.loops(outcome.loops)
+        writer.levels(outcome.levels)
         for fix in outcome.gnss:
             writer.gnss(fix)
         if outcome.ground_truth is not None:

@@ -123,6 +123,7 @@ def content(
         warnings={"gaps_bridged": 2},
         notes=["gaps between pair estimates that were bridged: 2"],
         remarks={"posegraph": "IMU on all steps"},
+        levels=_levels(pairs, truth),
         thumbnails=[Thumbnail(int(stamp), _picture(i)) for i, stamp in enumerate(stamps_ns[::20])],
     )
 
@@ -137,6 +138,21 @@ def _nearer(pairs: list[PairEstimate], truth: Trajectory, share: float) -> list[
     return [
         replace(pair, quat_wxyz=quat, translation=translation)
         for pair, quat, translation in zip(pairs, quats_wxyz, better.translation, strict=True)
+    ]
+
+
+def _levels(pairs: list[PairEstimate], truth: Trajectory) -> list[PairEstimate]:
+    """Five levels, from 16 times the errors of the pairs, which halve each time, to those of the pairs."""
+    levels = zip(*(_nearer(pairs, truth, 2.0**k) for k in (4, 3, 2, 1, 0)), strict=True)
+    return [
+        replace(
+            pair,
+            winner=-1,
+            hypotheses_quat_wxyz=np.stack([each.quat_wxyz for each in of_pair]),
+            hypotheses_translation=np.stack([each.translation for each in of_pair]),
+            errors=np.zeros(0),
+        )
+        for pair, of_pair in zip(pairs, levels, strict=True)
     ]
 
 

@@ -148,6 +148,13 @@ def test_frames_without_a_pair_are_one_event_for_each_hole(truth: Trajectory, pa
     assert events.missing_pairs(truth.stamps_ns, [*pairs[:100], spanning, *pairs[103:]], "/pairs") == []
 
 
+def test_where_there_are_no_frames_the_pairs_tell_which_are_missing(pairs: list[PairEstimate]) -> None:
+    """As in a log that holds pair estimates and no images."""
+    found = events.missing_pairs(np.zeros(0, dtype=np.int64), [*pairs[:100], *pairs[103:]], "/pairs")
+    assert [(event.kind, event.text) for event in found] == [(events.DROPPED_FRAMES, "2 frames missing")]
+    assert_allclose(_spans(found), [(10.0, 10.3)])
+
+
 def test_wrong_pairs_are_seen_by_their_neighbours(pairs: list[PairEstimate]) -> None:
     damaged = list(pairs)
     for i in (100, 101, 400):

@@ -304,6 +304,22 @@ def test_wrong_fixes_are_rejected_and_bend_nothing(share: float) -> None:
     assert ate_m(result.trajectory, log.truth) < 1.2 * ate_m(only_good.trajectory, log.truth)
 
 
+def test_fixes_in_the_world_are_where_the_antenna_was() -> None:
+    """Those that were believed are as far from the antenna's estimated path as the residual says; others are 50 m."""
+    log = driven(5, 80.0, Receiver(2.0, 1.0, outliers=0.2))
+    known = gnss.positions(log.fixes, UNKNOWN_ANTENNA, Findings())
+    result = log.solved()
+    assert known is not None
+    assert result.georeference is not None
+    placed = result.georeference.in_world(known, result.trajectory.stamps_ns)
+    assert_array_equal(placed.used, result.georeference.used)
+    path_m = result.trajectory.at(placed.stamps_ns).apply(result.georeference.antenna_m)
+    distance_m = np.linalg.norm(placed.places_m - path_m, axis=1)
+    assert_allclose(np.sqrt(np.mean(distance_m[placed.used] ** 2)), result.georeference.residual_rms_m, rtol=0.05)
+    assert not placed.used.all()
+    assert_allclose(distance_m[~placed.used], 50.0, atol=6.0)
+
+
 def test_a_receiver_that_hangs_is_not_believed() -> None:
     """It repeats a position for 20 of 80 s; the ATE stays below that of the raw chain."""
     log = driven(6, 80.0, Receiver(2.0, 1.0))

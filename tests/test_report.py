@@ -18,9 +18,10 @@ from report_samples import LENGTHS_M, content
 
 from fusion import events
 from fusion.evaluation import errors_over_time, evaluate
+from fusion.gnss import PlacedFixes
 from fusion.report import ReportContent, Thumbnail, write_report
 from fusion.report import content as content_module
-from fusion.report.figures import MAX_SAMPLES, Figure, figures
+from fusion.report.figures import MAX_SAMPLES, NEARLY_ZERO, Figure, figures
 from fusion.report.page import page
 from fusion.report.verdict import agreements, nis_bounds, verdict
 from fusion_io.reader import open_log
@@ -198,6 +199,27 @@ def test_what_is_not_finite_is_null(full: ReportContent) -> None:
     assert document["columns"][figure["rows"][0]["lines"][0]["y"]][:3] == [None, None, 1.0]
 
 
+def test_gnss_positions_are_drawn_believed_ones_apart(full: ReportContent) -> None:
+    stamps = full.trajectories["posegraph"].stamps_ns[::10]
+    places = full.trajectories["posegraph"].poses[::10].translation + [0.0, 1.0, 0.0]
+    used = np.arange(len(stamps)) != 3
+    document = json.loads(_unpacked(page(replace(full, fixes=PlacedFixes(stamps, places, used))), "data"))
+    assert [fixes["used"] for fixes in document["fixes"]] == [True, False]
+    for fixes, chosen in zip(document["fixes"], (used, ~used), strict=True):
+        drawn = np.stack([document["columns"][fixes[axis]] for axis in "xyz"], axis=1)
+        assert_allclose(drawn, places[chosen], rtol=1e-5, atol=1e-9)
+        assert_allclose(document["columns"][fixes["t"]], full.seconds(stamps[chosen]), atol=1e-6)
+    assert json.loads(_unpacked(page(full), "data"))["fixes"] == []
+
+
+def test_what_is_nearly_zero_does_not_stretch_a_logarithmic_axis(full: ReportContent) -> None:
+    """The last pair of a chain has nothing to contradict it: its NIS is 1e-25."""
+    nis = full.series["posegraph"].nis.copy()
+    nis[-1] = 1e-25
+    shown = _by_key(replace(full, series={"posegraph": replace(full.series["posegraph"], nis=nis)}))["nis"]
+    assert np.nanmin(_line(shown, 0, "pose graph").y) == NEARLY_ZERO
+
+
 # ---------------------------------------------------------------------------------------------- the verdict
 
 
@@ -208,6 +230,16 @@ def test_the_verdict_compares_with_raw(full: ReportContent) -> None:
     assert "better than raw" in said
     assert "IMU used" in said
     assert "1 warning." in said
+
+
+def test_an_imu_that_no_back_end_wants_is_not_called_used(full: ReportContent) -> None:
+    """As where it contradicts the pairs although it could be calibrated."""
+    none = np.full_like(full.series["posegraph"].gyro_bias, np.nan)
+    refused = {name: replace(each, gyro_bias=none) for name, each in full.series.items()}
+    assert "IMU calibrated, but no back end used it" in verdict(replace(full, series=refused)).text
+    assert full.calibration is not None
+    left_out = replace(full.calibration, used=False)
+    assert "IMU left out" in verdict(replace(full, series=refused, calibration=left_out)).text
 
 
 def test_a_run_worse_than_raw_is_called_bad(full: ReportContent) -> None:
@@ -313,6 +345,16 @@ def test_the_error_of_the_estimate_is_that_of_its_pairs(full: ReportContent) -> 
     assert list(names) == ["hypothesis 1", "hypothesis 2", "hypothesis 3", "hypothesis 4", "winner", "estimate"]
     assert_allclose(values[-1], full.metrics["raw"].rpe_translation_m, rtol=1e-3)
     assert values[4] == values[0] > 2.0 * values[-1]  # the winner is always the first, with three times the noise
+
+
+def test_the_error_by_level_falls_to_that_of_the_estimate(full: ReportContent) -> None:
+    figure = _by_key(full)["level-errors"]
+    names, values = figure.rows[0].lines[0].x, figure.rows[0].lines[0].y
+    assert list(names) == ["level 0", "level 1", "level 2", "level 3", "level 4", "estimate"]
+    assert_allclose(values[:4] / values[1:5], 2.0, rtol=0.02)  # as the samples are made
+    assert_allclose(values[-2:], full.metrics["raw"].rpe_translation_m, rtol=1e-3)
+    assert _by_key(replace(full, levels=()))["level-errors"].missing.startswith("The pair estimates were recorded")
+    assert "no ground truth" in _by_key(replace(full, ground_truth=None))["level-errors"].missing
 
 
 def test_agreement_is_zero_between_equals_and_in_sigmas_otherwise(full: ReportContent) -> None:

@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion import events
+from fusion import events, gnss
 from fusion.evaluation import KITTI_SEGMENT_LENGTHS_M, Metrics
 from fusion.events import Event
+from fusion.gnss import PlacedFixes
 from fusion.imu import ImuCalibration
 from fusion.measurements import Mounting
 from fusion_io.errors import LogError
+from fusion_io.findings import Findings
 from fusion_io.records import NANOSECONDS, EstimatorSeries, ImuSeries, IntArray, PairEstimate, Trajectory
 
 if TYPE_CHECKING:
@@ -45,7 +47,8 @@ class ReportContent:
     trajectories: by name, raw among them. segment_lengths_m: of t_rel and r_rel. series: what a back end estimated
     beside the poses, by its name; mounting: of the IMU, as the pose graph refined it; loops_used: which of the loops it
     believed (M,). topics: the name of each role. warnings: counts by name, notes: a line for each. remarks: what the
-    back ends say, by name.
+    back ends say, by name. fixes: GNSS positions, where the pose graph found out where the world is. levels: pairs
+    whose hypotheses are the motions after each level of the network.
     """
 
     title: str
@@ -66,6 +69,8 @@ class ReportContent:
     notes: Sequence[str] = ()
     remarks: Mapping[str, str] = field(default_factory=dict)
     thumbnails: Sequence[Thumbnail] = ()
+    fixes: PlacedFixes | None = None
+    levels: Sequence[PairEstimate] = ()
 
     @property
     def start_ns(self) -> int:
@@ -161,7 +166,17 @@ def content_of(outcome: Outcome) -> ReportContent:
         loops=outcome.loops,
         loops_used={name: each.loops_used for name, each in outcome.estimates.items()},
         thumbnails=thumbnails(log),
+        fixes=_fixes(outcome),
+        levels=outcome.levels,
     )
+
+
+def _fixes(outcome: Outcome) -> PlacedFixes | None:
+    """The GNSS positions on the pose graph's trajectory, None where they could not be tied to it."""
+    known = gnss.positions(outcome.gnss, outcome.config.gnss, Findings())
+    if known is None or outcome.georeference is None:
+        return None
+    return outcome.georeference.in_world(known, outcome.trajectories["posegraph"].stamps_ns)
 
 
 def thumbnails(log: Log) -> list[Thumbnail]:

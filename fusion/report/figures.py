@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
@@ -78,7 +79,7 @@ Builder = Callable[[ReportContent], Figure]
 def figures(content: ReportContent) -> dict[str, list[Figure]]:
     """All figures by the section that they stand in."""
     sections: dict[str, Sequence[Builder]] = {
-        "errors": (errors, components, segments, pair_errors, hypothesis_errors),
+        "errors": (errors, components, segments, pair_errors, level_errors, hypothesis_errors),
         "trust": (nees, nis, innovations, pair_deviations, agreement, loop_residuals),
         "sensors": (motion, periods, biases, front_end, spread),
     }
@@ -183,7 +184,7 @@ def pair_errors(content: ReportContent) -> Figure:
         "Each pair against the true motion between its frames.",
         missing="The log has no ground truth for its pairs.",
     )
-    truth = _true_motions(content)
+    truth = _true_motions(content, content.pairs)
     if truth is None:
         return found
     known, motions = truth
@@ -213,45 +214,52 @@ def pair_errors(content: ReportContent) -> Figure:
     )
 
 
-def hypothesis_errors(content: ReportContent) -> Figure:
-    """Root mean square error of each hypothesis, of the winner, of their mean, and of what became of them."""
+def level_errors(content: ReportContent) -> Figure:
+    """Root mean square error after each level of the network, and of what became of them."""
     found = Figure(
-        "hypothesis-errors",
-        "Error by hypothesis",
-        "RMSE over all pairs of the network's last level; estimate: the winner after refinement, as it was used. "
-        "The levels before the last are not recorded in a log; learned.evaluate shows them.",
-        missing="The log has no ground truth for its pairs.",
+        "level-errors",
+        "Error by level",
+        "RMSE over all pairs. Level 0 is what the IMU alone gives; each further level corrects it on a finer image; "
+        "estimate: the last one after refinement, as it was used.",
+        missing="The pair estimates were recorded without levels: they did not come from the network.",
         xlabel="",
         timed=False,
     )
-    truth = _true_motions(content)
+    of_pair = {(pair.source_stamp_ns, pair.target_stamp_ns): pair for pair in content.pairs}
+    levels = [each for each in content.levels if (each.source_stamp_ns, each.target_stamp_ns) in of_pair]
+    truth = _true_motions(content, levels)
     if truth is None:
-        return found
+        return _drawn(found, (), "The log has no ground truth for its pairs.") if levels else found
     known, motions = truth
-    with_hypotheses = [i for i in np.flatnonzero(known).tolist() if len(content.pairs[i].hypotheses_translation)]
-    if not with_hypotheses:
-        return _drawn(found, (), "The pair estimates were recorded without hypotheses.")
-    pairs = [content.pairs[i] for i in with_hypotheses]
-    motions = motions[np.searchsorted(np.flatnonzero(known), with_hypotheses)]
-    quats_wxyz, translations = _hypotheses(pairs)
-    count = translations.shape[1]
-    names, estimates = [], []
-    for i in range(count):
-        names.append(f"hypothesis {i + 1}")
-        estimates.append(_transforms(quats_wxyz[:, i], translations[:, i]))
-    chosen = np.arange(len(pairs)), np.array([min(max(pair.winner, 0), count - 1) for pair in pairs])
-    names += ["winner", "estimate"]
-    estimates += [_transforms(quats_wxyz[chosen], translations[chosen]), _motions(pairs)]
-    differences = [estimate.inv() * motions for estimate in estimates]
-    metres = np.array([np.sqrt(np.mean(_norm(each.translation) ** 2)) for each in differences])
-    milliradians = np.array([1e3 * np.sqrt(np.mean(each.rotation.magnitude() ** 2)) for each in differences])
-    return _drawn(
-        found,
-        [
-            Row("translation [m]", [Line("RMSE", names, metres, "pairs", mode="bars", legend=False)]),
-            Row("rotation [mrad]", [Line("RMSE", names, milliradians, "pairs", mode="bars", legend=False)]),
-        ],
+    shown = [levels[i] for i in np.flatnonzero(known).tolist()]
+    after = _each_hypothesis(shown)
+    names = [f"level {i}" for i in range(len(after))]
+    used = _motions([of_pair[each.source_stamp_ns, each.target_stamp_ns] for each in shown])
+    return _drawn(found, _rmse([*names, "estimate"], [*after, used], motions))
+
+
+def hypothesis_errors(content: ReportContent) -> Figure:
+    """Root mean square error of each hypothesis, of the winner, and of what became of it."""
+    found = Figure(
+        "hypothesis-errors",
+        "Error by hypothesis",
+        "RMSE over all pairs of the network's last level; estimate: the winner after refinement, as it was used.",
+        missing="The pair estimates were recorded without hypotheses: they did not come from the network.",
+        xlabel="",
+        timed=False,
     )
+    pairs = [pair for pair in content.pairs if len(pair.hypotheses_translation)]
+    truth = _true_motions(content, pairs)
+    if truth is None:
+        return _drawn(found, (), "The log has no ground truth for its pairs.") if pairs else found
+    known, motions = truth
+    pairs = [pairs[i] for i in np.flatnonzero(known).tolist()]
+    hypotheses = _each_hypothesis(pairs)
+    names = [f"hypothesis {i + 1}" for i in range(len(hypotheses))]
+    quats_wxyz, translations = _hypotheses(pairs)
+    chosen = np.arange(len(pairs)), np.array([min(max(pair.winner, 0), len(names) - 1) for pair in pairs])
+    winner = _transforms(quats_wxyz[chosen], translations[chosen])
+    return _drawn(found, _rmse([*names, "winner", "estimate"], [*hypotheses, winner, _motions(pairs)], motions))
 
 
 # ---------------------------------------------------------------------------------------------- trust
@@ -276,9 +284,9 @@ def nees(content: ReportContent) -> Figure:
             continue
         seconds = content.seconds(estimate.stamps_ns)
         metres, radians = pose_errors(estimate.poses, truth.poses)
-        squares = normalised_square(metres, estimate.covariances[:, 3:, 3:])
+        squares = _above_zero(normalised_square(metres, estimate.covariances[:, 3:, 3:]))
         position.append(Line(label(name), seconds, squares, name))
-        squares = normalised_square(radians, estimate.covariances[:, :3, :3])
+        squares = _above_zero(normalised_square(radians, estimate.covariances[:, :3, :3]))
         orientation.append(Line(label(name), seconds, squares, name, legend=False))
     if not position:
         return _drawn(found, (), "No trajectory states its covariance where there is ground truth.")
@@ -298,16 +306,18 @@ def nis(content: ReportContent) -> Figure:
         "nis",
         "NIS: do the measurements fit the model?",
         f"Squared innovation of each pair by its covariance, 6 degrees of freedom; 95 % between {low:.2f} and "
-        f"{high:.2f} where all is modelled right. Needs no ground truth.",
+        f"{high:.2f} where all is modelled right. Needs no ground truth. All near zero: nothing but the pairs spoke of "
+        "the motion.",
         missing=_without_series(content, "innovations"),
     )
     rows: list[Row] = []
     for name, each in shown.items():
         seconds = content.seconds(each.stamps_ns)
         inside = np.mean((each.nis >= low) & (each.nis <= high), where=np.isfinite(each.nis))
-        lines = [Line(f"{label(name)}, {100.0 * inside:.0f} % inside", seconds, each.nis, name)]
+        squares = _above_zero(each.nis)
+        lines = [Line(f"{label(name)}, {100.0 * inside:.0f} % inside", seconds, squares, name)]
         if np.any(out := ~each.used & np.isfinite(each.nis)):
-            lines.append(Line("rejected", seconds[out], each.nis[out], "fault", mode="markers", legend=not rows))
+            lines.append(Line("rejected", seconds[out], squares[out], "fault", mode="markers", legend=not rows))
         rows.append(Row(label(name), [*lines, *_bounds(_ends(seconds), low, high, legend=not rows)], log=True))
     return _drawn(found, rows)
 
@@ -344,7 +354,7 @@ def pair_deviations(content: ReportContent) -> Figure:
     lines = []
     seconds = content.seconds(_targets(content.pairs))
     for name in content.fused:
-        squares = np.maximum(events.deviations(content.pairs, content.trajectories[name]), NEARLY_ZERO)
+        squares = _above_zero(events.deviations(content.pairs, content.trajectories[name]))
         lines.append(Line(label(name), seconds, squares, name, only=name))
     rows = [Row("squared distance", [*lines, *_bounds(_ends(seconds), low, high)], log=True)] if lines else ()
     return _drawn(found, rows)
@@ -558,6 +568,11 @@ def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
     return squares
 
 
+def _above_zero(squares: FloatArray) -> FloatArray:
+    """The same (N,), none below where a logarithmic axis begins; what is NaN stays so."""
+    return np.maximum(squares, NEARLY_ZERO)
+
+
 def _drawn(figure: Figure, rows: Sequence[Row], missing: str = "") -> Figure:
     """A figure with these rows; without any, it says what is missing."""
     return replace(figure, rows=rows, missing="" if rows else missing or figure.missing)
@@ -646,11 +661,13 @@ def _speed(content: ReportContent, trajectory: Trajectory) -> tuple[FloatArray, 
     return content.seconds(trajectory.stamps_ns[1:]), _norm(np.diff(trajectory.poses.translation, axis=0)) / duration
 
 
-def _true_motions(content: ReportContent) -> tuple[np.ndarray, RigidTransform] | None:
-    """Which pairs (N,) the ground truth spans, and the true motions of those."""
-    if content.ground_truth is None or not content.pairs:
+def _true_motions(
+    content: ReportContent, pairs: Sequence[PairEstimate]
+) -> tuple[NDArray[np.bool_], RigidTransform] | None:
+    """Which of N pairs (N,) the ground truth spans, and the true motions of those; None where it spans none."""
+    if content.ground_truth is None or not pairs:
         return None
-    stamps = _spans(content.pairs)
+    stamps = _spans(pairs)
     known = content.ground_truth.covers(stamps[:, 0]) & content.ground_truth.covers(stamps[:, 1])
     if not np.any(known):
         return None
@@ -676,6 +693,23 @@ def _hypotheses(pairs: Sequence[PairEstimate]) -> tuple[FloatArray, FloatArray]:
     count = min(len(pair.hypotheses_translation) for pair in pairs)
     quats_wxyz = np.stack([pair.hypotheses_quat_wxyz[:count] for pair in pairs])
     return quats_wxyz, np.stack([pair.hypotheses_translation[:count] for pair in pairs])
+
+
+def _each_hypothesis(pairs: Sequence[PairEstimate]) -> list[RigidTransform]:
+    """The first hypotheses of N pairs, the second ones, and so on."""
+    quats_wxyz, translations = _hypotheses(pairs)
+    return [_transforms(quats_wxyz[:, i], translations[:, i]) for i in range(translations.shape[1])]
+
+
+def _rmse(names: Sequence[str], estimates: Sequence[RigidTransform], motions: RigidTransform) -> list[Row]:
+    """A bar for each estimate of N motions: the root mean square of its errors."""
+    differences = [estimate.inv() * motions for estimate in estimates]
+    metres = np.array([np.sqrt(np.mean(_norm(each.translation) ** 2)) for each in differences])
+    milliradians = np.array([1e3 * np.sqrt(np.mean(each.rotation.magnitude() ** 2)) for each in differences])
+    return [
+        Row("translation [m]", [Line("RMSE", names, metres, "pairs", mode="bars", legend=False)]),
+        Row("rotation [mrad]", [Line("RMSE", names, milliradians, "pairs", mode="bars", legend=False)]),
+    ]
 
 
 def _transforms(quats_wxyz: FloatArray, translations: FloatArray) -> RigidTransform:

@@ -17,6 +17,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from fusion.evaluation import common, errors_over_time
 from fusion.events import Event
@@ -25,7 +26,7 @@ from fusion.measurements import Mounting
 from fusion.report.content import ReportContent
 from fusion.report.figures import Figure, figures, sensor_stamps
 from fusion.report.verdict import Verdict, label, verdict
-from fusion.table import ROWS
+from fusion.table import ROWS, final_sigma, number
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 
 SHOWN_EVENTS = 5  # of a kind; the others are folded away
@@ -98,6 +99,7 @@ def _document(content: ReportContent, shown: Sequence[Figure]) -> str:
         "paths": [_path(content, name, columns) for name in content.trajectories],
         "truth": _truth(content, columns),
         "loops": _loops(content),
+        "fixes": _fixes(content, columns),
         "events": [_span(content, event) for event in content.events],
         "figures": [_figure(figure, columns) for figure in shown if figure.rows],
         "thumbnails": [
@@ -138,6 +140,18 @@ def _truth(content: ReportContent, columns: _Columns) -> dict[str, int] | None:
     _, truth = common(raw, content.ground_truth)
     laid_on_raw = Trajectory(truth.stamps_ns, raw.poses[int(np.argmax(spanned))] * truth.poses)
     return _positions(content, laid_on_raw, columns)
+
+
+def _fixes(content: ReportContent, columns: _Columns) -> list[dict[str, Any]]:
+    """GNSS positions, those that were believed apart from the others."""
+    if (known := content.fixes) is None:
+        return []
+    found = []
+    for used in (True, False):
+        if np.any(chosen := known.used == used):
+            fixes = Trajectory(known.stamps_ns[chosen], RigidTransform.from_translation(known.places_m[chosen]))
+            found.append({"used": used, **_positions(content, fixes, columns)})
+    return found
 
 
 def _loops(content: ReportContent) -> list[dict[str, Any]]:
@@ -212,23 +226,23 @@ def _metrics(content: ReportContent) -> str:
     values = {name: asdict(content.metrics[name]) if name in content.metrics else {} for name in names}
     body = []
     for row in ROWS:
-        numbers = [values[name].get(row.key) for name in names]
-        known = [abs(number - row.right) for number in numbers if number is not None]
+        measured = [values[name].get(row.key) for name in names]
+        known = [abs(value - row.right) for value in measured if value is not None]
         if not known:
             continue
         cells = [
             "<td>-</td>"
-            if number is None
-            else f"<td{' class=best' if abs(number - row.right) == min(known) else ''}>"
-            f"{_number(number * row.scale, row.decimals)}</td>"
-            for number in numbers
+            if value is None
+            else f"<td{' class=best' if abs(value - row.right) == min(known) else ''}>"
+            f"{number(value * row.scale, row.decimals)}</td>"
+            for value in measured
         ]
         body.append(
             f"<tr><th scope=row>{escape(row.label)} <small>{escape(row.unit)}</small></th>{''.join(cells)}</tr>"
         )
     for what, unit, cell in (
-        ("path length", "m", lambda each: _number(each.path_length_m, 1)),
-        ("stated 1-sigma at the end", "m", _final_sigma),
+        ("path length", "m", lambda each: number(each.path_length_m, 1)),
+        ("stated 1-sigma at the end", "m", final_sigma),
     ):
         cells = [f"<td>{escape(cell(content.trajectories[name]))}</td>" for name in names]
         body.append(f"<tr><th scope=row>{what} <small>{unit}</small></th>{''.join(cells)}</tr>")
@@ -240,7 +254,7 @@ def _calibration(content: ReportContent) -> str:
     """What is known of the IMU and whether it was used, and what the back ends say."""
     rows: list[tuple[str, str]] = []
     if (known := content.calibration) is not None:
-        rows.append(("IMU", f"{'used' if known.used else 'left out'}: {known.reason}"))
+        rows.append(("IMU", f"{'calibrated' if known.used else 'left out'}: {known.reason}"))
         if known.rotation_imu_camera is not None:
             quat = ", ".join(f"{part:.5f}" for part in known.rotation_imu_camera.as_quat(scalar_first=True))
             std = ", ".join(f"{part:.3f}" for part in np.rad2deg(known.rotation_std_rad))
@@ -302,7 +316,7 @@ def _event_rows(content: ReportContent, found: Sequence[Event]) -> str:
     for event in found:
         start, end = content.second(event.start_ns), content.second(event.end_ns)
         rows.append(
-            f'<tr data-seconds="{start:.3f}"><td><button>{start:.2f} - {end:.2f} s</button></td>'
+            f'<tr data-seconds="{start:.3f}"><td><button>{start:.2f} to {end:.2f} s</button></td>'
             f"<td>{escape(event.text)}</td></tr>"
         )
     return f"<table class=events><tbody>{''.join(rows)}</tbody></table>"
@@ -336,17 +350,6 @@ def _rate_cells(stamps_ns: IntArray) -> str:
     return f"<td>{len(stamps_ns)}</td>" + "".join(f"<td>{number}</td>" for number in numbers)
 
 
-def _number(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if abs(value) < 1e5 else f"{value:.2e}"
-
-
-def _final_sigma(trajectory: Trajectory) -> str:
-    """Root of the summed variances of the last position, as the back end states it."""
-    if trajectory.covariances is None:
-        return "-"
-    return _number(float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:]))), 2)
-
-
 def _pairs_table(rows: Iterable[tuple[str, str]]) -> str:
     body = "".join(f"<tr><th scope=row>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
     return f"<table class=pairs><tbody>{body}</tbody></table>"
@@ -357,13 +360,19 @@ def _frames(shown: Sequence[Figure]) -> str:
     return "".join(
         f'<figure id="{each.key}" class="{"time" if each.timed else "other"}"><h3>{escape(each.title)}</h3>'
         + (
-            f'<p class=caption>{escape(each.caption)}</p><div class="plot" style="--rows:{len(each.rows)}"></div>'
+            f"<p class=caption>{escape(each.caption)}</p>"
+            f'<div class="plot" style="--rows:{len(each.rows)};--listed:{_listed(each)}"></div>'
             if each.rows
             else f"<p class=empty>{escape(each.missing)}</p>"
         )
         + "</figure>"
         for each in shown
     )
+
+
+def _listed(figure: Figure) -> int:
+    """How many lines its legend names."""
+    return len({line.name for row in figure.rows for line in row.lines if line.legend and line.mode != "band"})
 
 
 def _slug(kind: str) -> str:

@@ -103,6 +103,14 @@
     return [{ ...drawn, y: edge(1) }, { ...drawn, y: edge(-1), fill: "tonexty", fillcolor: faded(line.style, 0.12) }];
   }
 
+  // Labels of whole decades, at most four of them; of 1, 2 and 5 where there are few.
+  function decades(row) {
+    const values = row.lines.flatMap((line) => column(line.y)).filter((value) => value > 0);
+    const [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [Infinity, 0]);
+    const span = Math.log10(high / low);
+    return span > 1.5 ? { dtick: Math.ceil(span / 4) } : span > 0.5 ? { dtick: "D2" } : { nticks: 5 };
+  }
+
   function drawFigure(figure) {
     const holder = document.querySelector(`#${figure.key} .plot`);
     const count = figure.rows.length;
@@ -113,7 +121,7 @@
       const top = 1 - i * (height + gap);
       axes[i ? `yaxis${i + 1}` : "yaxis"] = axis(row.label, {
         domain: [Math.max(top - height, 0), top], type: row.log ? "log" : "linear",
-        exponentformat: "power", nticks: 5, rangemode: figure.rows[i].lines.some((line) => line.mode === "bars") ? "tozero" : "normal",
+        exponentformat: "power", ...(row.log ? decades(row) : { nticks: 5 }), rangemode: figure.rows[i].lines.some((line) => line.mode === "bars") ? "tozero" : "normal",
       });
     });
     const bottom = count > 1 ? `y${count}` : "y";
@@ -170,6 +178,20 @@
     return data.loops.length ? [one(true), one(false)] : [];
   }
 
+  // GNSS positions of the antenna: rings, and crosses where they were not believed.
+  function fixTraces(type, ends) {
+    const flat = type === "scatter";
+    return data.fixes.map((fixes) => {
+      const name = fixes.used ? "GNSS" : "GNSS, not believed";
+      const ink = colour(fixes.used ? "gnss" : "fault");
+      const symbol = fixes.used ? "circle-open" : flat ? "x" : "diamond"; // not every font has the cross in space
+      return {
+        type, mode: "markers", name, ...ends(fixes), customdata: places(fixes), hovertemplate: `${name}<br>${hover}<extra></extra>`,
+        marker: { color: ink, size: flat ? 7 : 4, symbol, line: { width: fixes.used ? 1.5 : 0, color: ink } },
+      };
+    });
+  }
+
   function drawMap() {
     const traces = pathTraces((path, name, style, valued) => ({
       type: "scatter", name, x: column(path.x), y: column(path.z), customdata: places(path),
@@ -178,6 +200,7 @@
       ...(valued ? { marker: scale(path, 5) } : {}),
     }));
     traces.push(...loopTraces({ x: (path, i) => column(path.x)[i], y: (path, i) => column(path.z)[i] }, "scatter"));
+    traces.push(...fixTraces("scatter", (fixes) => ({ x: column(fixes.x), y: column(fixes.z) })));
     return Plotly.react(document.querySelector("#map .plot"), traces, layout({
       xaxis: axis("x, right of the first camera [m]"), yaxis: axis("z, ahead [m]", { scaleanchor: "x" }),
       hovermode: "closest", uirevision: "keep",
@@ -194,7 +217,9 @@
     const longest = Math.max(...ends.map(([low, high]) => high - low), 1e-6);
     const spans = ends.map(([low, high]) => Math.max(1.05 * (high - low), 0.1 * longest));
     const ranges = ends.map(([low, high], i) => [(low + high - spans[i]) / 2, (low + high + spans[i]) / 2]);
-    const [x, y, z] = spans.map((span) => (1.4 * span) / longest);
+    // As large as fits whatever its shape, with room for the labels.
+    const size = (matchMedia("(max-width: 700px)").matches ? 1.5 : 1.75) / Math.hypot(...spans);
+    const [x, y, z] = spans.map((span) => size * span);
     return { ranges, aspectratio: { x, y, z } };
   }
 
@@ -206,17 +231,18 @@
     }));
     const inSpace = { x: (path, i) => column(path.x)[i], y: (path, i) => column(path.z)[i], z: (path, i) => -column(path.y)[i] };
     traces.push(...loopTraces(inSpace, "scatter3d"));
+    traces.push(...fixTraces("scatter3d", (fixes) => ({ x: column(fixes.x), y: column(fixes.z), z: column(fixes.y).map((down) => -down) })));
     const here = spot();
     traces.push({
       type: "scatter3d", mode: "markers", x: [here.x], y: [here.z], z: [-here.y], hoverinfo: "skip", showlegend: false,
       marker: { color: colour("ink"), size: 6, symbol: "circle-open", line: { width: 3 } },
     });
     const { ranges, aspectratio } = box();
-    const side = (title, range) => ({ title: { text: title }, range, gridcolor: colour("grid"), backgroundcolor: colour("page"), color: colour("ink"), zerolinecolor: colour("line") });
+    const side = (title, range, length) => ({ title: { text: title }, range, nticks: Math.max(2, Math.round(5 * length)), gridcolor: colour("grid"), backgroundcolor: colour("page"), color: colour("ink"), zerolinecolor: colour("line") });
     return Plotly.react(document.querySelector("#space .plot"), traces, layout({
       margin: { l: 0, r: 0, t: 8, b: 0 },
       scene: {
-        xaxis: side("right [m]", ranges[0]), yaxis: side("ahead [m]", ranges[1]), zaxis: side("up [m]", ranges[2]),
+        xaxis: side("right [m]", ranges[0], aspectratio.x), yaxis: side("ahead [m]", ranges[1], aspectratio.y), zaxis: side("up [m]", ranges[2], aspectratio.z),
         aspectmode: "manual", aspectratio, dragmode: "turntable", camera: { eye: { x: -0.7, y: -1.4, z: 1.3 }, projection: { type: "orthographic" } },
       },
       uirevision: "keep",

@@ -137,7 +137,10 @@ def _consistency(content: ReportContent) -> tuple[str, Status]:
 def _imu(content: ReportContent) -> str:
     if content.imu is None or not len(content.imu):
         return "no IMU"
-    return "IMU used" if content.calibration is not None and content.calibration.used else "IMU left out"
+    if content.calibration is None or not content.calibration.used:
+        return "IMU left out"
+    refused = content.series and not any(each.knows_imu for each in content.series.values())
+    return "IMU calibrated, but no back end used it" if refused else "IMU used"
 
 
 def _agreement(names: tuple[str, str], first: Trajectory, second: Trajectory) -> Agreement:

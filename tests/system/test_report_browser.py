@@ -118,7 +118,7 @@ def test_every_figure_is_drawn(page: Any) -> None:
             plot.querySelectorAll('.scatterlayer .trace, .barlayer .trace').length,
         ])"""
     )
-    assert len(drawn) == 18
+    assert len(drawn) == 19
     for name, series, marks in drawn:
         if name != "space":
             assert series == marks > 0, name
