@@ -3,9 +3,9 @@
 Two layers (as in Qin et al., "VINS-Mono", 2018). A *fixed-lag smoother* has the variables and factors of
 `fusion.posegraph` for the last seconds; what leaves its window is marginalised into a Gaussian prior on what stays
 (Dong-Si and Mourikis, "Motion tracking with fixed-lag smoothing", 2011), by QR. It knows nothing of loops: its
-trajectory, the odometry, drifts. A *map* of keyframes holds how it drifted there, D = T_world_odometry, with the joint
-covariance of all of them (Roumeliotis and Burdick, "Stochastic cloning", 2002), so that a loop corrects all keyframes,
-and the present through the last of them. A full iSAM2 would have to eliminate the way back to the loop anew.
+trajectory, the odometry, drifts. The map of keyframes of `fusion.drift` holds how it drifted there, so that a loop
+corrects all keyframes, and the present through the last of them. A full iSAM2 would have to eliminate the way back to
+the loop anew.
 
 The pose of frame k depends on measurements until k only, given how the IMU is mounted, what its clock reads and the
 gyro's first bias. Those come from the whole log (`fusion.imu.calibrate`, and refined by `posegraph.solve` where the
@@ -15,7 +15,6 @@ log is not undone either: which stretches of the IMU are faulty, and how holes b
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,18 +24,18 @@ import numpy as np
 from gtsam.symbol_shorthand import B, E, G, S, V, X
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
-from scipy.linalg.blas import dgemm
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
 from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import PoseGraphConfig
+from fusion.drift import Closures, Odometry, Pose
 from fusion.factors import WorldFactor, by_vector, extrinsics, padded
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Measurements
 from fusion.pair_model import camera, difference, inverse, predict
 from fusion.posegraph import FIRST_POSE_SIGMA, GRAVITY, INTEGRATION_SIGMA, KNOT_S, REJECTED_WEIGHT, check
-from fusion_io.records import NANOSECONDS, FloatArray, PairEstimate, Trajectory
+from fusion_io.records import NANOSECONDS, FloatArray, Trajectory
 
 LAG = 10  # frames behind the latest one that are estimated anew with it
 SETTLING = 20  # frames that all stay at first, until velocity and gravity are known
@@ -44,9 +43,6 @@ ITERATIONS = 3  # while it settles, and where a pair was left out
 GRAVITY_SIGMA = 0.3  # rad, of the first direction: accelerations hide it
 VELOCITY_SIGMA = 30.0  # m/s, of the first one
 REJECTED_IN_A_ROW = 5  # pairs; then it is the prediction that is wrong
-
-KEYFRAME_S = 2.0
-ROOM = 32  # keyframes that the map grows by
 
 
 def solve(measurements: Measurements, config: PoseGraphConfig) -> Estimate:
@@ -62,42 +58,24 @@ def solve(measurements: Measurements, config: PoseGraphConfig) -> Estimate:
     return Estimate(trajectory, tracker.note, tracker.rejected, loops_used=tracker.loops_used)
 
 
-class Pose(NamedTuple):
-    """Of the camera: T_world_camera (4, 4) and its covariance (6, 6)."""
-
-    T: FloatArray
-    covariance: FloatArray
-
-
 class Tracker:
     """Follows a camera frame by frame."""
 
     def __init__(self, measurements: Measurements, config: PoseGraphConfig) -> None:
         self._smoother = Smoother(measurements, config)
-        self._map = Map(config.gate_probability)
-        self._stamps = stamps_of(measurements.steps)
-        self._loops = measurements.loops
-        self._arriving: dict[int, list[int]] = defaultdict(list)  # the loops that each frame brings
-        for row, loop in enumerate(self._loops):
-            self._arriving[self._frame(loop.target_stamp_ns)].append(row)
-        self._latest = 0
-        self.loops_used: NDArray[np.bool_] = np.zeros(len(self._loops), dtype=np.bool_)
+        self._closures = Closures(measurements.loops, stamps_of(measurements.steps), config.gate_probability)
+        self._steps = len(measurements.steps)
         self.present = Pose(np.eye(4), np.zeros((6, 6)))
 
     def advance(self) -> Pose:
         """The next frame."""
-        self._latest += 1
-        keyframe = self._map.last
-        odometry = self._smoother.advance(keyframe)
-        self.present = self._map.move_to(odometry)
-        for row in self._arriving[self._latest]:
-            loop = self._loops[row]
-            closed = self._map.close(self._frame(loop.source_stamp_ns), loop)
-            if closed is not None:
-                self.present, self.loops_used[row] = closed, True
-        if self._stamps[self._latest] - self._stamps[keyframe] >= KEYFRAME_S * NANOSECONDS:
-            self._map.keep()
+        self.present = self._closures.move_to(self._smoother.advance(self._closures.keyframe))
         return self.present
+
+    @property
+    def loops_used(self) -> NDArray[np.bool_]:
+        """Which of the loops (M,) were believed."""
+        return self._closures.used
 
     @property
     def rejected(self) -> int:
@@ -107,22 +85,11 @@ class Tracker:
     @property
     def note(self) -> str:
         """One line on how the measurements were used."""
-        measured, steps = self._smoother.inertial_steps, len(self._stamps) - 1
-        imu = f"IMU on {measured} of {steps} steps" if measured else "pairs only"
-        return imu + (f"; loops used: {self.loops_used.sum()} of {len(self._loops)}" if self._loops else "")
-
-    def _frame(self, stamp_ns: int) -> int:
-        return int(np.searchsorted(self._stamps, stamp_ns))
+        measured = self._smoother.inertial_steps
+        return (f"IMU on {measured} of {self._steps} steps" if measured else "pairs only") + self._closures.note
 
 
 # ------------------------------------------------------------------------------------------- the fixed-lag smoother
-
-
-class Odometry(NamedTuple):
-    """The latest pose T (4, 4) of the camera without loops, and the joint covariance (12, 12) of keyframe and it."""
-
-    T: FloatArray
-    joint: FloatArray
 
 
 class _Inertial(NamedTuple):
@@ -533,142 +500,3 @@ def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
     for key in keys:
         order.push_back(key)
     return order
-
-
-# ----------------------------------------------------------------------------------------------------------- the map
-
-
-class _Place(NamedTuple):
-    """A frame by its odometry T (4, 4), and by how much more it may have drifted than the keyframe before it.
-
-    own (6, 6): covariance of that, on the right of T.
-    """
-
-    keyframe: int
-    T: FloatArray
-    own: FloatArray
-
-
-class Map:
-    """How the odometry has drifted at the keyframes, all of them with their joint covariance.
-
-    The errors xi of a pose in the world, Exp(xi) D T, are on its left, where those of a drift in common are the same. A
-    loop of motion Z from frame i to frame k shows of them
-
-        Ad(X_k) Log((X_i^-1 X_k)^-1 Z) = xi_k - xi_i + noise                                                         (1)
-
-    Drift is a random walk. It grows as the odometry's covariance does, and no less than by that of the motion since the
-    keyframe: errors that last, of scale for one, add up faster than white ones.
-    """
-
-    def __init__(self, gate_probability: float) -> None:
-        self._gate = float(chi2.isf(gate_probability, 6))
-        self._places = [_Place(0, np.eye(4), np.zeros((6, 6)))]
-        self._keyframes = [0]  # their frames
-        self._drifts = np.tile(np.eye(4), (ROOM, 1, 1))
-        self._covariance = np.zeros((6 * ROOM, 6 * ROOM), order="F")
-        self._odometry_covariance = np.zeros((6, 6))  # of the last keyframe, when it was the latest frame
-        self._latest_covariance = np.zeros((6, 6))
-        self._closed = False
-
-    @property
-    def last(self) -> int:
-        """The frame of the last keyframe."""
-        return self._keyframes[-1]
-
-    def move_to(self, odometry: Odometry) -> Pose:
-        """The next frame."""
-        back = _adjoint(inverse(odometry.T) @ self._places[self.last].T)
-        since = np.hstack([-back, np.eye(6)])
-        least = since @ odometry.joint @ since.T
-        self._latest_covariance = odometry.joint[6:, 6:]
-        grown = self._latest_covariance - back @ self._odometry_covariance @ back.T
-        self._places.append(_Place(len(self._keyframes) - 1, odometry.T, least + _positive(grown - least)))
-        if not self._closed:
-            return Pose(odometry.T, self._latest_covariance)
-        T, own = self._at(-1)
-        return _seen(T, self._between(-1, -1) + own)
-
-    def keep(self) -> None:
-        """Make the latest frame a keyframe."""
-        _, own = self._at(-1)
-        before, number = self._places[-1].keyframe, len(self._keyframes)
-        if number == len(self._drifts):
-            self._drifts = np.concatenate([self._drifts, np.tile(np.eye(4), (ROOM, 1, 1))])
-            self._covariance = np.asfortranarray(np.pad(self._covariance, (0, 6 * ROOM)))
-        here = _block(number)
-        self._covariance[here] = self._covariance[_block(before)]
-        self._covariance[:, here] = self._covariance[here].T
-        self._covariance[here, here] = self._covariance[_block(before), _block(before)] + own
-        self._drifts[number] = self._drifts[before]
-        self._keyframes.append(len(self._places) - 1)
-        self._places[-1] = _Place(number, self._places[-1].T, np.zeros((6, 6)))
-        self._odometry_covariance = self._latest_covariance
-
-    def close(self, source: int, loop: PairEstimate) -> Pose | None:
-        """The latest pose after a loop from a frame to it; None where the loop is an outlier, and nothing changes."""
-        (T_source, own_source), (T, own) = self._at(source), self._at(-1)
-        to_world = _adjoint(T)
-        shown = inverse(T_source) @ T
-        beyond = to_world @ _log(inverse(shown) @ np.asarray(loop.T_source_target.as_matrix()))
-        rows = self._rows(-1) - self._rows(source)
-        of_latest = self._between(-1, -1) + own
-        with_latest = of_latest - self._between(-1, source)
-        spread = with_latest - self._between(source, -1) + self._between(source, source) + own_source
-        spread += to_world @ loop.covariance @ to_world.T
-        root = np.linalg.cholesky((spread + spread.T) / 2)
-        beyond, rows, row = (solve_triangular(root, each, lower=True) for each in (beyond, rows, with_latest.T))
-        if beyond @ beyond > self._gate:
-            return None
-        # Of this form it stays symmetric: what rounding leaves would grow from loop to loop.
-        dgemm(-1.0, rows, rows, beta=1.0, c=self._covariance, trans_a=True, overwrite_c=True)
-        moved = RigidTransform.from_exp_coords((beyond @ rows).reshape(-1, 6))
-        self._drifts = np.asarray(moved.as_matrix()) @ self._drifts
-        self._closed = True
-        return _seen(_exp(beyond @ row) @ T, of_latest - row.T @ row)
-
-    def _at(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """A frame in the world (4, 4), and the covariance (6, 6) on its left of what it has not from its keyframe."""
-        number, odometry, own = self._places[frame]
-        T = self._drifts[number] @ odometry
-        to_world = _adjoint(T)
-        return T, to_world @ own @ to_world.T
-
-    def _rows(self, frame: int) -> FloatArray:
-        """The covariances (6, 6 N) of a frame with all keyframes."""
-        return self._covariance[_block(self._places[frame].keyframe)]
-
-    def _between(self, one: int, other: int) -> FloatArray:
-        """The covariance (6, 6) of what two frames have from their keyframes."""
-        return np.asarray(self._rows(one)[:, _block(self._places[other].keyframe)])
-
-
-def _block(number: int) -> slice:
-    return slice(6 * number, 6 * number + 6)
-
-
-def _log(T: FloatArray) -> FloatArray:
-    """The twist (6,) of a rigid transform."""
-    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T)))
-
-
-def _exp(twist: FloatArray) -> FloatArray:
-    """The rigid transform (4, 4) of a twist."""
-    return np.asarray(gtsam.Pose3.Expmap(twist).matrix())
-
-
-def _adjoint(T: FloatArray) -> FloatArray:
-    return np.asarray(gtsam.Pose3(T).AdjointMap())
-
-
-def _positive(matrix: FloatArray) -> FloatArray:
-    """The part of a symmetric matrix that is positive."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _seen(T: FloatArray, on_the_left: FloatArray) -> Pose:
-    """A pose with the covariance of its errors on the right."""
-    to_camera = _adjoint(inverse(T))
-    covariance = to_camera @ on_the_left @ to_camera.T
-    return Pose(T, (covariance + covariance.T) / 2)
