@@ -24,6 +24,7 @@ from fusion.pair_model import inverse
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, PairEstimate, Trajectory
 
 KEYFRAME_S = 2.0
+LOOP_KEYFRAME_S = 1.0  # where a loop arrives: what it tells of the way since the last keyframe stays with the next only
 ROOM = 32  # keyframes that the map grows by
 
 
@@ -63,12 +64,14 @@ class Closures:
         """The next frame, where loops see it."""
         self._latest += 1
         present = self._map.move_to(odometry)
-        for row in self._arriving[self._latest]:
+        arriving = self._arriving[self._latest]
+        seconds = (self._stamps[self._latest] - self._stamps[self.keyframe]) / NANOSECONDS
+        if seconds >= (LOOP_KEYFRAME_S if arriving else KEYFRAME_S):
+            self._map.keep()
+        for row in arriving:
             closed = self._map.close(self._frame(self._loops[row].source_stamp_ns), self._loops[row])
             if closed is not None:
                 present, self.used[row] = closed, True
-        if self._stamps[self._latest] - self._stamps[self.keyframe] >= KEYFRAME_S * NANOSECONDS:
-            self._map.keep()
         return present
 
     def hindsight(self) -> Trajectory:
@@ -128,7 +131,9 @@ class Map:
         """The next frame."""
         back = _adjoint(inverse(odometry.T) @ self._places[self.last].T)
         since = np.hstack([-back, np.eye(6)])
-        least = since @ odometry.joint @ since.T
+        joint = odometry.joint.copy()
+        joint[:6, :6] = self._odometry_covariance  # a smoother knows more of the keyframe by now: T there stays as it was
+        least = since @ joint @ since.T
         self._latest_covariance = odometry.joint[6:, 6:]
         grown = self._latest_covariance - back @ self._odometry_covariance @ back.T
         self._places.append(_Place(len(self._keyframes) - 1, odometry.T, least + _positive(grown - least)))

@@ -2,8 +2,8 @@
 
 The nominal state lives outside the filter, which estimates its error (filterpy): the IMU moves the nominal state and
 spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
-moved into the nominal state; then the present pose becomes the clone. Everything is causal. Loops and satellite
-positions are not used: they are the pose graph's.
+moved into the nominal state; then the present pose becomes the clone. Everything is causal. Loops move the trajectory
+through the map of keyframes of `fusion.drift`, and leave the filter alone. Satellite positions are the pose graph's.
 
 Error state (37): attitude, position, velocity (in the IMU's axes), gyro bias, accelerometer bias, direction of gravity
 (2), scale error and rate bias of the front end (4), mounting, lever arm, time offset and misalignment (10), attitude
@@ -19,7 +19,8 @@ Kalman filter based visual-inertial odometry using direct photometric feedback",
 What a filter learns late, of scale or gravity, moves its position by what it got wrong all the way before. A trajectory
 whose past stays where it was must not jump by that: its positions are the sum of the motions as they were known when
 they happened (the trail), and the covariance of that sum is carried along exactly, as that of a state which no update
-moves (Schmidt, "Application of state-space methods to navigation problems", 1966).
+moves; so is that of the camera's pose at the last keyframe (Schmidt, "Application of state-space methods to navigation
+problems", 1966).
 
 For the same reason the scale error of the front end is only considered: it widens the covariance, and accelerations do
 not estimate it. What they tell of it within seconds is little beside gravity and their own bias.
@@ -43,6 +44,7 @@ from scipy.stats import chi2
 
 from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import EkfConfig
+from fusion.drift import Closures, Odometry, Pose
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.pair_model import Prediction, adjoint, camera, difference, exp, inverse, predict, right_jacobian, skew
@@ -62,6 +64,10 @@ MOUNTING, LEVER_ARM, TIME_OFFSET, MISALIGNMENT = slice(21, 24), slice(24, 27), s
 EXTRINSICS, MOUNTED = slice(21, 28), slice(21, 31)
 CLONE_ATTITUDE, CLONE_POSITION = slice(31, 34), slice(34, 37)
 DIMENSION = 37
+
+# Where the errors of the past stand: of the IMU's position on the trail, and of the camera's pose at the last keyframe.
+TRAIL, KEYFRAME = slice(0, 3), slice(3, 9)
+PAST = 9
 
 # Two small turns of Q move its third column so: Exp(x, y, 0) e3 = e3 + TILT (x, y).
 TILT = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
@@ -293,8 +299,10 @@ class Filter:
         tie[POSITION, EXTRINSICS] = tie[CLONE_POSITION, EXTRINSICS] = R @ by_extrinsics[3:]
         self.kf.P = tie @ P @ tie.T
         self.trail = p  # of the IMU
-        self.trail_covariance = self.kf.P[POSITION, POSITION].copy()
-        self.trail_cross = self.kf.P[POSITION].copy()  # with the error of the state
+        self.past_covariance = np.zeros((PAST, PAST))  # of what no update moves
+        self.past_covariance[TRAIL, TRAIL] = self.kf.P[POSITION, POSITION]
+        self.past_cross = np.zeros((PAST, DIMENSION))  # with the error of the state
+        self.past_cross[TRAIL] = self.kf.P[POSITION]
         self.imu_walk = np.zeros(DIMENSION)
         self.imu_walk[ATTITUDE] = config.gyro_noise**2
         self.imu_walk[GYRO_BIAS] = config.gyro_bias_walk**2
@@ -356,7 +364,7 @@ class Filter:
     def _move_error(self, H: FloatArray) -> None:
         """After an update by H (M, 37): move the error into the state, and reset it."""
         G = reset_jacobian(self.kf.x)
-        self.trail_cross = self.trail_cross @ (np.eye(DIMENSION) - self.kf.K @ H).T @ G.T
+        self.past_cross = self.past_cross @ (np.eye(DIMENSION) - self.kf.K @ H).T @ G.T
         P = G @ self.kf.P @ G.T
         self.kf.P = (P + P.T) / 2
         self.state = inject(self.state, self.kf.x)
@@ -366,15 +374,20 @@ class Filter:
         """Add the motion since the clone to the trail, and make the present pose the clone; it errs as that does."""
         self.trail = self.trail + self.state.p - self.state.clone[:3, 3]
         added = self.kf.P[POSITION] - self.kf.P[CLONE_POSITION]
-        cross = self.trail_cross[:, POSITION] - self.trail_cross[:, CLONE_POSITION]
-        self.trail_covariance += cross + cross.T + added[:, POSITION] - added[:, CLONE_POSITION]
-        self.trail_cross = self.trail_cross + added
+        cross = self.past_cross[:, POSITION] - self.past_cross[:, CLONE_POSITION]
+        covariance = self.past_covariance.copy()
+        covariance[:, TRAIL] += cross
+        covariance[TRAIL] += cross.T
+        covariance[TRAIL, TRAIL] += added[:, POSITION] - added[:, CLONE_POSITION]
+        self.past_covariance = covariance
+        self.past_cross = self.past_cross.copy()
+        self.past_cross[TRAIL] += added
         self.state = replace(self.state, clone=self.state.pose, clone_twist=self.state.twist)
         copy = np.eye(DIMENSION)
         copy[CLONE_ATTITUDE] = copy[ATTITUDE]
         copy[CLONE_POSITION] = copy[POSITION]
         self.kf.P = copy @ self.kf.P @ copy.T
-        self.trail_cross = self.trail_cross @ copy.T
+        self.past_cross = self.past_cross @ copy.T
 
     def forget_velocity(self) -> None:
         """Make the velocity as uncertain as at first, and independent of all else."""
@@ -399,21 +412,45 @@ class Filter:
         P[VELOCITY], P[:, VELOCITY] = 0.0, 0.0
         P[VELOCITY, VELOCITY] = variance * np.eye(3)
         self.kf.P = P
-        self.trail_cross = self.trail_cross.copy()
-        self.trail_cross[:, VELOCITY] = 0.0
+        self.past_cross = self.past_cross.copy()
+        self.past_cross[:, VELOCITY] = 0.0
 
-    def camera(self) -> tuple[FloatArray, FloatArray]:
-        """The pose of the camera (4, 4) on the trail, and its covariance (6, 6), rotation first, right perturbation."""
+    def odometry(self) -> Odometry:
+        """The pose of the camera on the trail, and its covariance with that at the last keyframe."""
+        T, by_state, by_past = self._camera()
+        of_present, _ = self._present(by_state, by_past)
+        with_keyframe = (by_state @ self.past_cross.T + by_past @ self.past_covariance)[:, KEYFRAME]
+        of_keyframe = self.past_covariance[KEYFRAME, KEYFRAME]
+        return Odometry(T, np.block([[of_keyframe, with_keyframe.T], [with_keyframe, of_present]]))
+
+    def keep(self) -> None:
+        """Make the present pose of the camera the keyframe."""
+        _, by_state, by_past = self._camera()
+        of_present, with_state = self._present(by_state, by_past)
+        with_past = by_state @ self.past_cross.T + by_past @ self.past_covariance
+        covariance, cross = self.past_covariance.copy(), self.past_cross.copy()
+        covariance[KEYFRAME], covariance[:, KEYFRAME] = with_past, with_past.T
+        covariance[KEYFRAME, KEYFRAME] = of_present
+        cross[KEYFRAME] = with_state
+        self.past_covariance, self.past_cross = covariance, cross
+
+    def _camera(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The camera's pose (4, 4) on the trail, and how it changes with the state (6, 37) and the past (6, 9)."""
         state = self.state
         on_trail = pose(state.R, self.trail)[None]
         cameras, by_pose, by_extrinsics = camera(on_trail, state.T_camera_imu, state.twist[None], state.ahead_s)
-        J = np.zeros((6, DIMENSION))
-        J[:, ATTITUDE] = by_pose[0, :, :3]
-        J[:, EXTRINSICS] = by_extrinsics[0]
-        by_trail = by_pose[0, :, 3:] @ state.R.T
-        crossed = by_trail @ self.trail_cross @ J.T
-        of_trail = by_trail @ self.trail_covariance @ by_trail.T
-        return cameras[0], J @ self.kf.P @ J.T + crossed + crossed.T + of_trail
+        by_state, by_past = np.zeros((6, DIMENSION)), np.zeros((6, PAST))
+        by_state[:, ATTITUDE] = by_pose[0, :, :3]
+        by_state[:, EXTRINSICS] = by_extrinsics[0]
+        by_past[:, TRAIL] = by_pose[0, :, 3:] @ state.R.T
+        return cameras[0], by_state, by_past
+
+    def _present(self, by_state: FloatArray, by_past: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The covariance (6, 6) of a pose, and that (6, 37) with the error of the state."""
+        crossed = by_past @ self.past_cross @ by_state.T
+        of_past = by_past @ self.past_covariance @ by_past.T
+        covariance = by_state @ self.kf.P @ by_state.T + crossed + crossed.T + of_past
+        return (covariance + covariance.T) / 2, by_state @ self.kf.P + by_past @ self.past_cross
 
     def mounting(self) -> Mounting:
         """How the IMU is mounted, as far as it is known by now."""
@@ -487,15 +524,15 @@ class Filter:
         noise = by_noise @ noise @ by_noise.swapaxes(1, 2)
         for self.kf.F, self.kf.Q in zip(jacobians, noise, strict=True):
             self.kf.predict()
-            self.trail_cross = self.trail_cross @ self.kf.F.T
+            self.past_cross = self.past_cross @ self.kf.F.T
 
 
 def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     """Filter the steps, which follow each other, with the IMU where there is one.
 
     Steps that it did not measure from start to end are predicted by constant velocity and rate; without any that it
-    measured nothing is predicted, and the poses are those of the chain. Loops, pairs that skip
-    frames and positions are not used: they speak of poses that a filter has left behind.
+    measured nothing is predicted, and the poses are those of the chain. Each pose is that of its own instant; what
+    loops tell of earlier ones is in `Estimate.hindsight`. Pairs that skip frames and positions are not used.
     """
     steps, calibration = measurements.steps, measurements.calibration
     samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
@@ -506,20 +543,23 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     first_twist = steps[0].T_source_target.as_exp_coords() / steps[0].duration_s
     ekf = Filter(config, calibration, measurements.mounting, config.front_end_sigma(steps), first_twist)
     gate = chi2.isf(config.gate_probability, 6)
-    rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [ekf.camera()]
+    stamps_ns = stamps_of(steps)
+    closures = Closures(measurements.loops, stamps_ns, config.gate_probability)
+    rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [Pose(np.eye(4), np.zeros((6, 6)))]
     in_a_row = 0
-    for step, motion, window, stands in zip(steps, motions_of(steps).as_matrix(), windows, still, strict=True):
+    motions = motions_of(steps).as_matrix()
+    for frame, (step, motion, window, stands) in enumerate(zip(steps, motions, windows, still, strict=True), 1):
         pair = Measurement(motion, step.covariance + _by_stamps(step, config.stamp_jitter_s), step.duration_s)
         if calibration is not None and np.any(_during(calibration.bias_steps_ns, step)):
             ekf.doubt_gyro_bias(calibration.gyro_bias_std)
-        before = ekf.state, ekf.kf.P, ekf.trail_cross
+        before = ekf.state, ekf.kf.P, ekf.past_cross
         ekf.predict(window, pair.seconds)
         innovation, nis = ekf.squared_innovation(pair)
         used = nis <= gate or in_a_row >= config.max_rejected_in_a_row
         if nis <= gate:
             in_a_row = 0
         elif used:  # so many cannot all be wrong: it is the prediction that is
-            ekf.state, ekf.kf.P, ekf.trail_cross = before
+            ekf.state, ekf.kf.P, ekf.past_cross = before
             ekf.forget_velocity()
             ekf.predict(None, pair.seconds)
         else:
@@ -532,20 +572,22 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
             ekf.take_twist(pair)
         ekf.clone()
         rows.append(_row(ekf, innovation, nis, used))
-        cameras.append(ekf.camera())
+        cameras.append(closures.move_to(ekf.odometry()))
+        if closures.keyframe == frame:
+            ekf.keep()
 
-    stamps_ns = stamps_of(steps)
     series = EstimatorSeries(stamps_ns, *(np.array(column) for column in zip(*rows, strict=True)))
     poses, covariances = (np.stack(column) for column in zip(*cameras, strict=True))
-    covariances[0] = 0.0  # the world itself, but for rounding
-    rejected = int(np.sum(~series.used))
+    pairs_rejected = int(np.sum(~series.used))
     measured = sum(window is not None for window in windows)
     return Estimate(
         Trajectory(stamps_ns, RigidTransform.from_matrix(poses), covariances),
-        _note(measured, len(steps), rejected),
-        rejected,
+        _note(measured, len(steps), pairs_rejected) + closures.note,
+        pairs_rejected + int(np.sum(~closures.used)),
         series if calibration is not None else _without_biases(series),
+        loops_used=closures.used,
         mounting=ekf.mounting() if calibration is not None else None,
+        hindsight=closures.hindsight() if np.any(closures.used) else None,
     )
 
 

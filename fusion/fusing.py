@@ -65,6 +65,8 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
     for name in asked[1:] if "posegraph" in asked else asked:
         if estimate := _attempt(name, refined, config, findings):
             estimates[name] = estimate
+            if estimate.hindsight is not None:
+                estimates[f"{name}_smoothed"] = Estimate(estimate.hindsight, "the filter's past, moved by its loops")
     return estimates
 
 

@@ -86,7 +86,8 @@ class Estimate:
     trajectory: with the covariance of every pose. note: one line on how the measurements were used. rejected: how many
     of them were left out as outliers. series: what was estimated beside the poses. loops_used (M,): which of the loops
     were believed; empty for a back end that takes none. mounting: as it was refined. georeference: where on the earth
-    the world is, where positions told it.
+    the world is, where positions told it. hindsight: of a causal back end, the trajectory where its last instant sees
+    it, where loops moved what was before them.
     """
 
     trajectory: Trajectory
@@ -96,3 +97,4 @@ class Estimate:
     loops_used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     mounting: Mounting | None = None
     georeference: Georeference | None = None
+    hindsight: Trajectory | None = None

@@ -34,7 +34,7 @@ from fusion_io.writer import LogWriter
 
 SCHEMA = 1
 LOG_NAME = "run.mcap"
-TRAJECTORIES = ("raw", "posegraph", "posegraph_online", "ekf")
+TRAJECTORIES = ("raw", "posegraph", "posegraph_online", "ekf", "ekf_smoothed")
 
 # What sensor_msgs/CameraInfo calls uncalibrated: K is zero.
 NOT_CALIBRATED = CameraInfo(0, 0, np.zeros((3, 3)))

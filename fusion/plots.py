@@ -21,6 +21,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "posegraph": {"label": "pose graph", "color": "#0072B2", "linestyle": "-"},
     "posegraph_online": {"label": "pose graph, online", "color": "#CC79A7", "linestyle": (0, (5, 1))},
     "ekf": {"label": "EKF", "color": "#D55E00", "linestyle": "-."},
+    "ekf_smoothed": {"label": "EKF, smoothed", "color": "#E69F00", "linestyle": (0, (3, 1, 1, 1))},
 }
 GROUND_TRUTH_STYLE: dict[str, Any] = {"label": "ground truth", "color": "black", "linestyle": "-", "linewidth": 1.0}
 SIGMA_STYLE: dict[str, Any] = {"linestyle": ":", "linewidth": 1.2}

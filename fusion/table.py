@@ -15,7 +15,13 @@ from fusion_io.records import Trajectory
 
 Metrics = Mapping[str, float | int | None]
 
-HEADINGS = {"raw": "raw", "posegraph": "pose graph", "posegraph_online": "online", "ekf": "EKF"}
+HEADINGS = {
+    "raw": "raw",
+    "posegraph": "pose graph",
+    "posegraph_online": "online",
+    "ekf": "EKF",
+    "ekf_smoothed": "smoothed",
+}
 
 WIDTH_OF_NUMBER = 9
 

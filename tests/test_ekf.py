@@ -177,17 +177,18 @@ def _filter(mounting: Mounting | None = None) -> Filter:
 
 
 class WithTrail(Filter):
-    """A filter with the trail as a state of the whole: matrices (40, 40), no shortcuts, a gain of zero for it."""
+    """A filter with the past as a state of the whole: matrices (46, 46), no shortcuts, a gain of zero for it."""
 
     def __init__(self, *arguments: object) -> None:
         super().__init__(*arguments)  # type: ignore[arg-type]
-        at_first = np.eye(DIMENSION)[[*range(DIMENSION), *range(*ekf.POSITION.indices(DIMENSION))]]
+        at_first = np.zeros((46, DIMENSION))
+        at_first[:37], at_first[37:40] = np.eye(DIMENSION), np.eye(DIMENSION)[ekf.POSITION]
         self.joint = at_first @ self.kf.P @ at_first.T
         self.noise = np.zeros((0, 0))
         predict = self.kf.predict
 
         def both() -> None:
-            F, Q = np.eye(40), np.zeros((40, 40))
+            F, Q = np.eye(46), np.zeros((46, 46))
             F[:37, :37], Q[:37, :37] = self.kf.F, self.kf.Q
             self.joint = F @ self.joint @ F.T + Q
             predict()
@@ -203,9 +204,9 @@ class WithTrail(Filter):
         super().stand_still()
 
     def _move_error(self, H: FloatArray) -> None:
-        gain = np.vstack([self.kf.K, np.zeros((3, len(H)))])
-        left = np.eye(40) - gain @ np.hstack([H, np.zeros((len(H), 3))])
-        reset = np.eye(40)
+        gain = np.vstack([self.kf.K, np.zeros((9, len(H)))])
+        left = np.eye(46) - gain @ np.hstack([H, np.zeros((len(H), 9))])
+        reset = np.eye(46)
         reset[:37, :37] = reset_jacobian(self.kf.x)
         self.joint = reset @ (left @ self.joint @ left.T + gain @ self.noise @ gain.T) @ reset.T
         super()._move_error(H)
@@ -216,17 +217,24 @@ class WithTrail(Filter):
         super()._renew_velocity(variance)
 
     def clone(self) -> None:
-        copy = np.eye(40)
-        copy[37:, ekf.POSITION] += np.eye(3)
-        copy[37:, ekf.CLONE_POSITION] -= np.eye(3)
-        copy[ekf.CLONE_ATTITUDE] = np.eye(40)[ekf.ATTITUDE]
-        copy[ekf.CLONE_POSITION] = np.eye(40)[ekf.POSITION]
+        copy = np.eye(46)
+        copy[37:40, ekf.POSITION] += np.eye(3)
+        copy[37:40, ekf.CLONE_POSITION] -= np.eye(3)
+        copy[ekf.CLONE_ATTITUDE] = np.eye(46)[ekf.ATTITUDE]
+        copy[ekf.CLONE_POSITION] = np.eye(46)[ekf.POSITION]
         self.joint = copy @ self.joint @ copy.T
         super().clone()
 
+    def keep(self) -> None:
+        _, by_state, by_past = self._camera()
+        become = np.eye(46)
+        become[40:] = np.hstack([by_state, by_past])
+        self.joint = become @ self.joint @ become.T
+        super().keep()
 
-def test_the_covariance_of_the_trail_is_that_of_an_explicit_schmidt_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over a drive that has a hole in the IMU, a wild pair and a stand-still."""
+
+def test_the_covariance_of_the_past_is_that_of_explicit_schmidt_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of trail and keyframe, over a drive that has a hole in the IMU, a wild pair and a stand-still."""
     filters: list[WithTrail] = []
     monkeypatch.setattr(ekf, "Filter", lambda *arguments: filters.append(WithTrail(*arguments)) or filters[-1])
     monkeypatch.setattr(ekf, "standing_still", lambda steps, *_: np.arange(len(steps)) // 10 == 3)
@@ -237,9 +245,11 @@ def test_the_covariance_of_the_trail_is_that_of_an_explicit_schmidt_state(monkey
     assert result.rejected == 1
     (found,) = filters
     assert_allclose(found.kf.P, found.joint[:37, :37], rtol=1e-6, atol=1e-12)
-    assert_allclose(found.trail_cross, found.joint[37:, :37], rtol=1e-6, atol=1e-12)
-    assert_allclose(found.trail_covariance, found.joint[37:, 37:], rtol=1e-6, atol=1e-12)
-    assert not np.allclose(found.trail_covariance, found.kf.P[ekf.POSITION, ekf.POSITION], rtol=0.05)
+    assert_allclose(found.past_cross, found.joint[37:, :37], rtol=1e-6, atol=1e-12)
+    assert_allclose(found.past_covariance, found.joint[37:, 37:], rtol=1e-6, atol=1e-12)
+    assert not np.allclose(
+        found.past_covariance[ekf.TRAIL, ekf.TRAIL], found.kf.P[ekf.POSITION, ekf.POSITION], rtol=0.05
+    )
 
 
 def test_where_the_first_camera_is_the_world_it_is_so_for_any_mounting() -> None:
@@ -248,7 +258,7 @@ def test_where_the_first_camera_is_the_world_it_is_so_for_any_mounting() -> None
     root = 0.1 * rng.normal(size=(10, 10))
     mounting = Mounting(_transform(rng), 0.05, 0.1 * rng.normal(size=3), root @ root.T, np.zeros(3), np.ones(3))
     for filter_ in (_filter(), _filter(mounting)):
-        pose, covariance = filter_.camera()
+        pose, covariance = (part[-6:, -6:] if len(part) == 12 else part for part in filter_.odometry())
         assert_allclose(pose, np.eye(4), atol=1e-12)
         assert_allclose(covariance, 0.0, atol=1e-12)
         extrinsics = np.zeros(DIMENSION)
@@ -458,11 +468,11 @@ def test_when_a_prediction_is_given_up_nothing_of_it_stays(monkeypatch: pytest.M
     predict, forget = Filter.predict, Filter.forget_velocity
 
     def remember(self: Filter, window: ImuWindow | None, seconds: float) -> None:
-        self.before = self.trail_cross.copy()  # type: ignore[attr-defined]
+        self.before = self.past_cross.copy()  # type: ignore[attr-defined]
         predict(self, window, seconds)
 
     def compare(self: Filter) -> None:
-        given_up.append((self.before, self.trail_cross.copy()))  # type: ignore[attr-defined]
+        given_up.append((self.before, self.past_cross.copy()))  # type: ignore[attr-defined]
         forget(self)
 
     monkeypatch.setattr(Filter, "predict", remember)
@@ -516,3 +526,30 @@ def test_the_same_input_gives_the_same_bits() -> None:
     one, other = (_solve(drive, drive.measurements.steps[:40]) for _ in range(2))
     assert_array_equal(one.trajectory.poses.as_matrix(), other.trajectory.poses.as_matrix())
     assert_array_equal(one.trajectory.covariances, other.trajectory.covariances)
+
+
+def test_a_loop_moves_the_present_and_what_was_before() -> None:
+    """A loop from the truth: the end is where it says, hindsight moves the way there, and the filter stays as it was."""
+    drive = _drive()
+    known, truth = drive.measurements, drive.truth
+    motion = truth.poses[5].inv() * truth.poses[-1]
+    sigma = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
+    loop = PairEstimate(
+        int(truth.stamps_ns[5]),
+        int(truth.stamps_ns[-1]),
+        motion.rotation.as_quat(scalar_first=True),
+        motion.translation,
+        np.diag(sigma**2),
+    )
+    before, after = (ekf.solve(replace(known, loops=loops), EKF) for loops in ([], [loop]))
+    assert before.hindsight is None
+    assert after.hindsight is not None
+    assert after.loops_used.tolist() == [True]
+    assert_array_equal(after.trajectory.poses[:-1].as_matrix(), before.trajectory.poses[:-1].as_matrix())
+    assert _distance_m(after.trajectory, truth) < 0.2 * _distance_m(before.trajectory, truth)
+    assert_allclose(after.hindsight.poses[-1].as_matrix(), after.trajectory.poses[-1].as_matrix(), atol=1e-9)
+    errors = [
+        np.linalg.norm(each.poses.translation - truth.poses.translation, axis=1).mean()
+        for each in (before.trajectory, after.hindsight)
+    ]
+    assert errors[1] < errors[0]
