@@ -14,8 +14,9 @@ STAMP  := $(VENV)/.installed
 demo: $(STAMP)
 	$(PY) -m fusion.run --log samples/kitti06.mcap --config samples/kitti06.toml --out runs/demo --segment-lengths 10,20,30,40,50
 
+# A worker for each core, with one thread; a file stays with one worker, so that what its tests share is made once.
 test: lint types
-	$(PY) -m pytest
+	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses auto --dist loadfile
 
 lint: $(STAMP)
 	$(PY) -m ruff check .

@@ -132,7 +132,7 @@ class Map:
         back = _adjoint(inverse(odometry.T) @ self._places[self.last].T)
         since = np.hstack([-back, np.eye(6)])
         joint = odometry.joint.copy()
-        joint[:6, :6] = self._odometry_covariance  # a smoother knows more of the keyframe by now: T there stays as it was
+        joint[:6, :6] = self._odometry_covariance  # a smoother knows more of it by now, but T there stays as it was
         least = since @ joint @ since.T
         self._latest_covariance = odometry.joint[6:, 6:]
         grown = self._latest_covariance - back @ self._odometry_covariance @ back.T

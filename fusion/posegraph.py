@@ -28,7 +28,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
 from fusion import gnss, marginals, outliers
-from fusion.chain import ImuWindow, ImuWindows, chain
+from fusion.chain import ImuWindow, ImuWindows, chain, motions_of
 from fusion.config import PoseGraphConfig, Robust
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
 from fusion.imu import ImuCalibration
@@ -211,7 +211,7 @@ def _repaired(
         return chain(steps)
     seconds = np.array([step.duration_s for step in steps])
     middle = np.cumsum(seconds) - seconds / 2
-    rates = np.stack([step.T_source_target.as_exp_coords() for step in steps]) / seconds[:, None]
+    rates = motions_of(steps).as_exp_coords() / seconds[:, None]
     good = ~wrong
     bridged = list(steps)
     for k in np.flatnonzero(wrong).tolist():
