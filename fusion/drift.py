@@ -92,12 +92,13 @@ class Closures:
 class _Place(NamedTuple):
     """A frame by its odometry T (4, 4), and by how much more it may have drifted than the keyframe before it.
 
-    own (6, 6): covariance of that, on the right of T.
+    own (6, 6): covariance of that, on the right of T. covariance (6, 6): of T, before any loop.
     """
 
     keyframe: int
     T: FloatArray
     own: FloatArray
+    covariance: FloatArray
 
 
 class Map:
@@ -114,7 +115,7 @@ class Map:
 
     def __init__(self, gate_probability: float) -> None:
         self._gate = float(chi2.isf(gate_probability, 6))
-        self._places = [_Place(0, np.eye(4), np.zeros((6, 6)))]
+        self._places = [_Place(0, np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)))]
         self._keyframes = [0]  # their frames
         self._drifts = np.tile(np.eye(4), (ROOM, 1, 1))
         self._covariance = np.zeros((6 * ROOM, 6 * ROOM), order="F")
@@ -136,7 +137,8 @@ class Map:
         least = since @ joint @ since.T
         self._latest_covariance = odometry.joint[6:, 6:]
         grown = self._latest_covariance - back @ self._odometry_covariance @ back.T
-        self._places.append(_Place(len(self._keyframes) - 1, odometry.T, least + _positive(grown - least)))
+        own = least + _positive(grown - least)
+        self._places.append(_Place(len(self._keyframes) - 1, odometry.T, own, self._latest_covariance))
         if not self._closed:
             return Pose(odometry.T, self._latest_covariance)
         T, own = self._at(-1)
@@ -155,7 +157,7 @@ class Map:
         self._covariance[here, here] = self._covariance[_block(before), _block(before)] + own
         self._drifts[number] = self._drifts[before]
         self._keyframes.append(len(self._places) - 1)
-        self._places[-1] = _Place(number, self._places[-1].T, np.zeros((6, 6)))
+        self._places[-1] = self._places[-1]._replace(keyframe=number, own=np.zeros((6, 6)))
         self._odometry_covariance = self._latest_covariance
 
     def close(self, source: int, loop: PairEstimate) -> Pose | None:
@@ -181,7 +183,11 @@ class Map:
         return _seen(_exp(beyond @ row) @ T, of_latest - row.T @ row)
 
     def hindsight(self) -> list[Pose]:
-        """All frames; between two keyframes the drift goes from the one to the other."""
+        """All frames; between two keyframes the drift goes from the one to the other.
+
+        Where a walk, which drift is taken for, makes a pose more uncertain than it was before any loop, the covariance is
+        that of then: loops only add to what is known.
+        """
         poses = []
         for frame, place in enumerate(self._places):
             T, own = self._at(frame)
@@ -190,12 +196,14 @@ class Map:
                 begin, end = self._keyframes[number : number + 2]
                 further = self._drifts[number + 1] @ inverse(self._drifts[number])
                 T = _exp((frame - begin) / (end - begin) * _log(further)) @ T
-            poses.append(_seen(T, self._between(frame, frame) + own))
+            seen = _seen(T, self._between(frame, frame) + own)
+            before = place.covariance
+            poses.append(seen if np.linalg.det(seen.covariance) <= np.linalg.det(before) else Pose(T, before))
         return poses
 
     def _at(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """A frame in the world (4, 4), and the covariance (6, 6) on its left of what it has not from its keyframe."""
-        number, odometry, own = self._places[frame]
+        number, odometry, own, _ = self._places[frame]
         T = self._drifts[number] @ odometry
         to_world = _adjoint(T)
         return T, to_world @ own @ to_world.T

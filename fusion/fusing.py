@@ -66,7 +66,9 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
         if estimate := _attempt(name, refined, config, findings):
             estimates[name] = estimate
             if estimate.hindsight is not None:
-                estimates[f"{name}_smoothed"] = Estimate(estimate.hindsight, "the filter's past, moved by its loops")
+                estimates[f"{name}_smoothed"] = Estimate(
+                    estimate.hindsight, "the EKF in hindsight: its loops move what was before them"
+                )
     return estimates
 
 
