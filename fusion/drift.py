@@ -185,7 +185,7 @@ class Map:
     def hindsight(self) -> list[Pose]:
         """All frames; between two keyframes the drift goes from the one to the other.
 
-        Where a walk, which drift is taken for, makes a pose more uncertain than it was before any loop, the covariance is
+        Where a walk, which drift is taken for, makes a pose less certain than it was before any loop, the covariance is
         that of then: loops only add to what is known.
         """
         poses = []
