@@ -23,7 +23,6 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, E, G, L, S, U, V, X
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
@@ -167,9 +166,11 @@ def _refuse_contradiction(
     if contradicted.mean() > MAX_CONTRADICTED:
         raise RuntimeError(f"it contradicts {contradicted.sum()} of {len(contradicted)} pairs")
     factors = (graph.at(i) for i in range(graph.size()))
-    squares = [2.0 * each.error(values) for each in factors if isinstance(each, gtsam.ImuFactorWithGravityDirection)]
+    inertial = [each for each in factors if isinstance(each, gtsam.ImuFactorWithGravityDirection)]
+    squares = np.array([2.0 * each.error(values) for each in inertial])
     for steps, most in MAX_IMU_SQUARES.items():
-        worst = np.max(median_filter(squares, steps), initial=0.0)
+        stretches = np.lib.stride_tricks.sliding_window_view(squares, min(steps, len(squares)))
+        worst = np.max(np.median(stretches, axis=1))
         if worst > most:
             raise RuntimeError(f"the IMU is {np.sqrt(worst):.1f} standard deviations off the motion for {steps} frames")
 
