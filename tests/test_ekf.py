@@ -529,7 +529,7 @@ def test_the_same_input_gives_the_same_bits() -> None:
 
 
 def test_a_loop_moves_the_present_and_what_was_before() -> None:
-    """A loop from the truth: the end is where it says, hindsight moves the way there, and the filter stays as it was."""
+    """A loop from the truth: the end is where it says, hindsight moves the way there, the filter itself stays put."""
     drive = _drive()
     known, truth = drive.measurements, drive.truth
     motion = truth.poses[5].inv() * truth.poses[-1]
