@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from fusion.imu import ImuCalibration, in_camera_axes, on_camera_clock
 from fusion.measurements import Estimate, Measurements
 from fusion_io.errors import FusionError
 from fusion_io.findings import Findings
-from fusion_io.records import ImuSeries, IntArray, PairEstimate
+from fusion_io.records import NANOSECONDS, ImuSeries, IntArray, PairEstimate
 
 
 def back_ends(config: RunConfig) -> Sequence[str]:
@@ -37,10 +38,23 @@ def measurements(
     faulty = len(calibration.faulty_ns)
     findings.put("imu_faulty_stretches", faulty, f"faulty stretches of the IMU, left out: {faulty}")
     steps, gaps = chain.bridge_gaps(frame_stamps, pairs, inertial)
-    findings.put("gaps_bridged", gaps, f"gaps between pair estimates that were bridged: {gaps}")
+    longest_s, at_s = longest_gap(pairs)
+    where = f"; the longest: {longest_s:.1f} s from {at_s:.1f} s" if longest_s > 0.0 else ""
+    findings.put("gaps_bridged", gaps, f"gaps between pair estimates that were bridged: {gaps}{where}")
     if not calibration.used:
         return Measurements(steps)
     return Measurements(steps, on_camera_clock(imu, calibration), calibration)
+
+
+def longest_gap(pairs: Sequence[PairEstimate]) -> tuple[float, float]:
+    """The longest time (s) that no pair spans, and when it begins (s since the first pair)."""
+    ends_ns = sorted((pair.source_stamp_ns, pair.target_stamp_ns) for pair in pairs)
+    if not ends_ns:
+        return 0.0, 0.0
+    reached_ns = list(accumulate((target for _, target in ends_ns), max))
+    gaps_ns = [(later[0] - reached, reached) for reached, later in zip(reached_ns[:-1], ends_ns[1:], strict=True)]
+    gap_ns, begin_ns = max(gaps_ns, default=(0, 0))
+    return gap_ns / NANOSECONDS, (begin_ns - ends_ns[0][0]) / NANOSECONDS
 
 
 def between_steps(pairs: Sequence[PairEstimate], steps: Sequence[PairEstimate]) -> list[PairEstimate]:

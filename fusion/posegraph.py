@@ -149,7 +149,7 @@ def _solve(
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
-        _note(windows, without_imu, len(rejected), loops_used)
+        _note(windows, without_imu, len(measurements.skips), len(rejected), loops_used)
         + gnss.note(measurements.gnss, georeference, without_gnss),
         len(rejected) + int(wrong.imu.sum()) + sum(int(np.sum(each.weights < 0.5)) for each in others),
         series_of(problem, solution, pairs),
@@ -526,10 +526,15 @@ def _std_at(problem: Problem, solution: Solution, symbol: Callable[[int], int]) 
 
 
 def _note(
-    windows: Sequence[ImuWindow | None], without_imu: str, pairs_rejected: int, loops_used: NDArray[np.bool_]
+    windows: Sequence[ImuWindow | None],
+    without_imu: str,
+    skips: int,
+    pairs_rejected: int,
+    loops_used: NDArray[np.bool_],
 ) -> str:
     measured = sum(window is not None for window in windows)
     imu = f"pairs only: {without_imu}" if not measured else f"IMU on {measured} of {len(windows)} steps"
+    skipping = f"; {skips} pairs that skip a frame" if skips else ""
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
-    return imu + rejected + loops
+    return imu + skipping + rejected + loops

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter, strftime
@@ -277,6 +277,7 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
     title = f"{log.path.name}: {len(outcome.trajectories['raw'])} frames, {outcome.duration_s:.1f} s"
     metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
     print_table(Console(file=stream), title, outcome.trajectories, metrics)
+    print(f"At the end, right, down and ahead of the start: {'; '.join(ends(outcome.trajectories))}", file=stream)
     for remark in (*log.remarks, *outcome.findings.remarks):
         print(remark, file=stream)
     refused = "calibrated, but no back end used it" if calibration.used else "left out"
@@ -284,6 +285,16 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
     for name, estimate in outcome.estimates.items():
         print(f"{HEADINGS[name]}: {estimate.note}", file=stream)
     print(f"Results: {folder}", file=stream)
+
+
+def ends(trajectories: Mapping[str, Trajectory]) -> list[str]:
+    """Where the camera was at the end by each trajectory; how sure that is stands in the table."""
+    from fusion.table import HEADINGS
+
+    return [
+        f"{HEADINGS[name]} {', '.join(f'{value:.1f}' for value in each.poses.translation[-1])} m"
+        for name, each in trajectories.items()
+    ]
 
 
 def exit_code(outcome: Outcome) -> int:

@@ -133,3 +133,15 @@ def test_an_imu_that_is_not_used_does_not_reach_the_back_ends_and_gaps_are_bridg
     assert (found.imu, found.calibration) == (None, None)
     assert len(found.steps) == len(KNOWN.steps)
     assert findings.counts == {"gaps_bridged": 1}
+
+
+def test_the_longest_gap_is_between_what_pairs_reach_and_the_next() -> None:
+    """A pair that spans others hides what is between them; where nothing is missing there is none."""
+    steps = list(KNOWN.steps)
+    spanning = replace(steps[10], target_stamp_ns=steps[14].target_stamp_ns)
+    assert fusing.longest_gap(steps)[0] == 0.0
+    assert fusing.longest_gap([])[0] == 0.0
+    assert fusing.longest_gap([*steps[:11], *steps[14:]])[0] == pytest.approx(0.3)
+    assert fusing.longest_gap([*steps[:10], spanning, *steps[14:]])[0] == 0.0
+    gap_s, begins_s = fusing.longest_gap([*steps[:5], *steps[7:20], *steps[30:]])
+    assert (gap_s, begins_s) == (pytest.approx(1.0), pytest.approx(2.0))

@@ -76,7 +76,7 @@ def test_help_needs_none_of_the_heavy_packages() -> None:
 
 def test_the_command_computes_all_and_prints_one_table(command: Command) -> None:
     assert (command.result.returncode, command.result.stderr) == (0, "")
-    for words in ("raw", "pose graph", "EKF", "t_rel", "ATE", "IMU used", "Results: out"):
+    for words in ("raw", "pose graph", "EKF", "t_rel", "ATE", "IMU used", "At the end", "Results: out"):
         assert words in command.result.stdout
     table, _ = command.result.stdout.split("Lower is better")
     assert max(map(len, table.splitlines())) <= 80
