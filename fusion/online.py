@@ -34,7 +34,16 @@ from fusion.factors import WorldFactor, by_vector, extrinsics, padded
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Measurements
 from fusion.pair_model import camera, difference, inverse, predict
-from fusion.posegraph import FIRST_POSE_SIGMA, GRAVITY, INTEGRATION_SIGMA, KNOT_S, REJECTED_WEIGHT, check
+from fusion.posegraph import (
+    FIRST_POSE_SIGMA,
+    GRAVITY,
+    KNOT_S,
+    REJECTED_WEIGHT,
+    check,
+    front_end_walk,
+    preintegrate,
+    preintegration,
+)
 from fusion_io.records import NANOSECONDS, FloatArray, Trajectory
 
 LAG = 10  # frames behind the latest one that are estimated anew with it
@@ -115,6 +124,7 @@ class Smoother:
 
     def __init__(self, measurements: Measurements, config: PoseGraphConfig) -> None:
         self._config = config
+        self._parameters = preintegration(config)
         self._steps = measurements.steps
         self._seconds = (stamps_of(self._steps) - self._steps[0].source_stamp_ns) / NANOSECONDS
         motions = motions_of(self._steps)
@@ -185,7 +195,7 @@ class Smoother:
             return None
         knot = self._knots[step]
         bias = self._values.atConstantBias(B(knot)) if step else _first_bias(self._calibration)
-        return _Inertial(window, preintegrate(window, bias, self._config))
+        return _Inertial(window, preintegrate(window, bias, self._parameters))
 
     def _judge(self, step: int, measured: _Inertial) -> tuple[bool, bool]:
         """Whether the IMU, and whether the pair, is wrong: where they contradict each other, who leaves the last rate.
@@ -443,33 +453,6 @@ class Smoother:
     def _first_of_knot(self, key: int, oldest: int) -> int:
         """The first frame that needs a variable like this one while `oldest` is in the window."""
         return self._begins[self._knots[oldest]] if chr(gtsam.Symbol(key).chr()) in "bs" else oldest
-
-
-def front_end_walk(knot: int, dt: float, sigmas: tuple[float, float], config: PoseGraphConfig) -> gtsam.NonlinearFactor:
-    """From one state of the front end to the next after dt seconds: a Gauss-Markov process."""
-    sigma = np.repeat(sigmas, [1, 3])
-    keep = np.exp(-dt / np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3]))
-    whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
-    unit = gtsam.noiseModel.Unit.Create(4)
-    linear = gtsam.JacobianFactor(S(knot), -whitener * keep, S(knot + 1), whitener, np.zeros(4), unit)
-    point = gtsam.Values()
-    point.insert(S(knot), np.zeros(4))
-    point.insert(S(knot + 1), np.zeros(4))
-    return gtsam.LinearContainerFactor(linear, point)
-
-
-def preintegrate(
-    window: ImuWindow, bias: gtsam.imuBias.ConstantBias, config: PoseGraphConfig
-) -> gtsam.PreintegratedImuMeasurements:
-    """What the IMU measured during a step; gravity is a variable of the graph."""
-    parameters = gtsam.PreintegrationParams(np.zeros(3))
-    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
-    parameters.setAccelerometerCovariance(config.accelerometer_noise**2 * np.eye(3))
-    parameters.setIntegrationCovariance(INTEGRATION_SIGMA**2 * np.eye(3))
-    preintegrated = gtsam.PreintegratedImuMeasurements(parameters, bias)
-    for duration, rate, acceleration in zip(*window, strict=True):
-        preintegrated.integrateMeasurement(acceleration, rate, duration)
-    return preintegrated
 
 
 def _factor_of(batch: WorldFactor) -> gtsam.NonlinearFactor:

@@ -313,20 +313,34 @@ def _add_preintegrated(
     config: PoseGraphConfig,
 ) -> None:
     """A factor for every step that the IMU measured; over the others the velocity walks."""
-    parameters = gtsam.PreintegrationParams(np.zeros(3))  # gravity is a variable of the graph
-    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
-    parameters.setAccelerometerCovariance(config.accelerometer_noise**2 * np.eye(3))
-    parameters.setIntegrationCovariance(INTEGRATION_SIGMA**2 * np.eye(3))
+    parameters = preintegration(config)
     for k, (window, dt) in enumerate(zip(windows, seconds, strict=True)):
         if window is None:
             walk = gtsam.noiseModel.Isotropic.Sigma(3, config.unknown_acceleration * np.sqrt(dt))
             graph.add(gtsam.BetweenFactorVector(V(k), V(k + 1), np.zeros(3), walk))
             continue
-        preintegrated = gtsam.PreintegratedImuMeasurements(parameters, bias)
-        for duration, rate, acceleration in zip(*window, strict=True):
-            preintegrated.integrateMeasurement(acceleration, rate, duration)
         variables = (X(k), V(k), X(k + 1), V(k + 1), B(int(knots[k])), G(0))
-        graph.add(gtsam.ImuFactorWithGravityDirection(*variables, preintegrated, GRAVITY))
+        measured = preintegrate(window, bias, parameters)
+        graph.add(gtsam.ImuFactorWithGravityDirection(*variables, measured, GRAVITY))
+
+
+def preintegration(config: PoseGraphConfig) -> gtsam.PreintegrationParams:
+    """The noise of the IMU; gravity is a variable of the graph."""
+    parameters = gtsam.PreintegrationParams(np.zeros(3))
+    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
+    parameters.setAccelerometerCovariance(config.accelerometer_noise**2 * np.eye(3))
+    parameters.setIntegrationCovariance(INTEGRATION_SIGMA**2 * np.eye(3))
+    return parameters
+
+
+def preintegrate(
+    window: ImuWindow, bias: gtsam.imuBias.ConstantBias, parameters: gtsam.PreintegrationParams
+) -> gtsam.PreintegratedImuMeasurements:
+    """What the IMU measured during a step."""
+    preintegrated = gtsam.PreintegratedImuMeasurements(parameters, bias)
+    for duration, rate, acceleration in zip(*window, strict=True):
+        preintegrated.integrateMeasurement(acceleration, rate, duration)
+    return preintegrated
 
 
 def _gravity(windows: Sequence[tuple[int, ImuWindow]], poses: FloatArray, velocities: FloatArray) -> FloatArray:
@@ -361,23 +375,31 @@ def _add_pairs(problem: Problem, pairs: Sequence[PairEstimate], knots: IntArray 
 
 
 def _add_front_end(problem: Problem, front_end_sigma: tuple[float, float], config: PoseGraphConfig) -> None:
-    """The lasting errors of the front end fade and wander: a Gauss-Markov process."""
+    """The lasting errors of the front end, one state a knot."""
     sigma = np.repeat(front_end_sigma, [1, 3])
-    correlation_s = np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3])
-    unit = gtsam.noiseModel.Unit.Create(4)
     first = _first(problem.knots)
     seconds = np.diff(problem.stamps_ns[first]) / NANOSECONDS
     for j in range(len(first)):
         problem.values.insert(S(j), np.zeros(4))
     problem.graph.add(gtsam.PriorFactorVector(S(0), np.zeros(4), _diagonal(sigma)))
     for j, dt in enumerate(seconds):
-        keep = np.exp(-dt / correlation_s)
-        whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
-        linear = gtsam.JacobianFactor(S(j), -whitener * keep, S(j + 1), whitener, np.zeros(4), unit)
-        point = gtsam.Values()
-        point.insert(S(j), np.zeros(4))
-        point.insert(S(j + 1), np.zeros(4))
-        problem.graph.add(gtsam.LinearContainerFactor(linear, point))
+        problem.graph.add(front_end_walk(j, dt, front_end_sigma, config))
+
+
+def front_end_walk(knot: int, dt: float, sigmas: tuple[float, float], config: PoseGraphConfig) -> gtsam.NonlinearFactor:
+    """From one state of the front end to the next after dt seconds they fade and wander: a Gauss-Markov process.
+
+    sigmas: of scale error and rate bias (rad/s), as long as nothing is known of them.
+    """
+    sigma = np.repeat(sigmas, [1, 3])
+    keep = np.exp(-dt / np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3]))
+    whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
+    unit = gtsam.noiseModel.Unit.Create(4)
+    linear = gtsam.JacobianFactor(S(knot), -whitener * keep, S(knot + 1), whitener, np.zeros(4), unit)
+    point = gtsam.Values()
+    point.insert(S(knot), np.zeros(4))
+    point.insert(S(knot + 1), np.zeros(4))
+    return gtsam.LinearContainerFactor(linear, point)
 
 
 def _diagonal(sigmas: FloatArray) -> gtsam.noiseModel.Diagonal:
