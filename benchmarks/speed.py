@@ -49,7 +49,7 @@ from learned.warp import project
 from learned.weights import Weights
 
 WIDTH, HEIGHT = 1242, 375
-PAIRS = 3 * PAIRS_A_BATCH
+PAIRS = 12 * PAIRS_A_BATCH
 ONE_BY_ONE = 8
 """Pairs that are computed one at a time: enough for a median, and the plain version is slow."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,13 +29,14 @@ PAIRS_A_BATCH = 8
 FRAMES_AHEAD = 8
 """Frames decoded and prepared while the network works."""
 
-BATCHES_AHEAD = 1
-"""Batches that the network estimates while the one before is refined."""
+BATCHES_AHEAD = 2
+"""Batches that the network estimates, at the same time, while the one before is refined."""
 
 LONGEST_STEP = 1.5
 """Frames further apart than this many median frame periods have a missing frame between them."""
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 class FrameSource(Protocol):
@@ -140,14 +141,14 @@ def infer(
 ) -> Iterator[Inference]:
     """Run the network, and the refinement if asked for, over consecutive frames, a few pairs at a time.
 
-    Frames, network and refinement are three stages that work at the same time, each in one thread: that keeps two
-    cores busier than threads within an operation, and the result does not depend on their number.
+    Frames, network and refinement are three stages that work at the same time, in threads of one operation each: that
+    keeps the cores busier than threads within an operation, and the result does not depend on their number.
     """
     weights = replace(weights, model=for_inference(weights.model))
     with single_threaded():
         ready = prefetched((ready_frame(f, weights.model.config, refined) for f in frames), FRAMES_AHEAD)
         batch = batches(consecutive(ready, frame_stamps, skipped))
-        estimated = prefetched(((pairs, infer_batch(weights, pairs, imu)) for pairs in batch), BATCHES_AHEAD)
+        estimated = computed_ahead(lambda pairs: (pairs, infer_batch(weights, pairs, imu)), batch, BATCHES_AHEAD)
         before = np.eye(4)  # the motion of the pair before: another start of the refinement
         for pairs, inferences in estimated:
             motions = np.stack([inference.levels[-1] for inference in inferences])
@@ -184,6 +185,17 @@ def prefetched(items: Iterator[Item], count: int) -> Iterator[Item]:
         while (item := waiting.popleft().result()) is not end:
             waiting.append(pool.submit(next, items, end))
             yield item  # type: ignore[misc]
+
+
+def computed_ahead(function: Callable[[Item], Result], items: Iterable[Item], count: int) -> Iterator[Result]:
+    """The function of each item, in order, computed by `count` threads at the same time."""
+    with ThreadPoolExecutor(count) as pool:
+        waiting: deque[Future[Result]] = deque()
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) > count:
+                yield waiting.popleft().result()
+        yield from (each.result() for each in waiting)
 
 
 def consecutive(

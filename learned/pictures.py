@@ -60,7 +60,7 @@ def warp(model: VIOLearner, batch: Batch, pose: torch.Tensor) -> tuple[torch.Ten
     forward = model.config.warp == "source_to_target"
     sampled, reference = (batch.target, batch.source) if forward else (batch.source, batch.target)
     grid, visible = project(batch.source_depth, batch.K, pose)
-    warped, _ = sample(sampled, grid)
+    warped = sample(sampled, grid)
     error = (warped - reference).abs().mean(1)
     return torch.where(visible[:, None], warped, torch.nan), torch.where(visible, error, torch.nan)
 

@@ -36,6 +36,36 @@ def score(name: str, estimates: FloatArray, truth: FloatArray) -> Score:
     )
 
 
+class Agreement(TypedDict):
+    """Root mean squares of how far two estimates are apart, and of the error that both share."""
+
+    apart_translation_m: float
+    apart_rotation_rad: float
+    shared_translation_m: float
+    shared_rotation_rad: float
+
+
+def agreement(one: FloatArray, other: FloatArray, truth: FloatArray) -> Agreement:
+    """What two estimates (N, 4, 4) made in different ways say of the reference (N, 4, 4) that they are judged by.
+
+    Of independent errors the squares of the distances between the three are the sums of two of the squares, so that
+    each follows from the distances ("three-cornered hat": Gray and Allan, "A method for estimating the frequency
+    stability of an individual oscillator", 1974). What both estimates have in common (calibration, stamps) counts as
+    the reference's.
+    """
+    first, second, apart = (
+        np.mean(np.square(error_norms(a, b)), axis=1) for a, b in ((one, truth), (other, truth), (one, other))
+    )
+    shared = np.maximum((first + second - apart) / 2, 0.0)
+    (apart_m, apart_rad), (shared_m, shared_rad) = np.sqrt([apart, shared]).tolist()
+    return Agreement(
+        apart_translation_m=apart_m,
+        apart_rotation_rad=apart_rad,
+        shared_translation_m=shared_m,
+        shared_rotation_rad=shared_rad,
+    )
+
+
 def error_norms(estimates: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Norms (N,) of the errors in m, and angles (N,) in rad, of poses (N, 4, 4) against true ones."""
     relative = np.linalg.inv(estimates) @ truth

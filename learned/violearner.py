@@ -157,7 +157,7 @@ def conv(inputs: int, outputs: int, kernel: int | tuple[int, int], stride: int) 
     """Convolution with "same" padding and its activation."""
     kernel = kernel if isinstance(kernel, tuple) else (kernel, kernel)
     padding = (kernel[0] // 2, kernel[1] // 2)
-    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel, stride, padding), nn.LeakyReLU(0.1))
+    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel, stride, padding), nn.LeakyReLU(0.1, inplace=True))
 
 
 class Head(nn.Module):
@@ -280,8 +280,8 @@ class VIOLearner(nn.Module):
         views = {}
         for scale in sorted(set(SCALES)):
             views[scale] = View(
-                self.normalise_contrast(functional.avg_pool2d(sampled, scale)),
-                self.normalise_contrast(functional.avg_pool2d(reference, scale)),
+                self.normalise_contrast(pool_image(sampled, scale)),
+                self.normalise_contrast(pool_image(reference, scale)),
                 pool_depth(batch.source_depth, scale),
                 pool_intrinsics(batch.K, scale),
             )
@@ -324,6 +324,11 @@ def geometry(view: View) -> Tensor:
     inverse = torch.where(view.depth > 0, 1 / view.depth.clamp(min=NEAREST_DEPTH_M), torch.zeros_like(view.depth))
     rows = [ray_x.expand(-1, height, -1), ray_y.expand(-1, -1, width), inverse]
     return torch.stack([gain * row for gain, row in zip(GEOMETRY_GAINS, rows, strict=True)], dim=1)
+
+
+def pool_image(image: Tensor, scale: int) -> Tensor:
+    """An image (B, C, H, W) at a coarser scale: the mean of its pixels."""
+    return image if scale == 1 else functional.avg_pool2d(image, scale)
 
 
 def pool_depth(depth: Tensor, scale: int) -> Tensor:

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 NEAREST_DEPTH_M = 0.1
 """Points closer than this to the camera plane, or behind it, are not visible."""
@@ -56,47 +57,44 @@ def project(depth: Tensor, K: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     return grid.transpose(1, 2).reshape(*depth.shape, 2), visible.reshape(depth.shape)
 
 
-def sample(image: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
-    """Bilinear samples of an image and their derivatives with respect to the grid.
+def sample(image: Tensor, grid: Tensor) -> Tensor:
+    """Bilinear samples (B, C, H', W') of an image (B, C, H, W) at a grid (B, H', W', 2), differentiable by the grid.
 
-    image (B, C, H, W), grid (B, H', W', 2). Returns values (B, C, H', W') and gradients
-    (B, C, H', W', 2): d value / d (x, y). Values are differentiable with respect to the grid.
-    Source: paper, equations 1 to 3 (the sub-gradients of a spatial transformer).
+    Beyond the border they are those of the border. Source: paper, equation 1.
     """
     height, width = image.shape[-2:]
-    grid = grid.nan_to_num()  # of a network that has diverged: no place in the image
-    x = grid[..., 0].clamp(0, width - 1)
-    y = grid[..., 1].clamp(0, height - 1)
-    x0 = x.detach().floor().clamp(max=width - 2)
-    y0 = y.detach().floor().clamp(max=height - 2)
-    wx, wy = (x - x0)[:, None], (y - y0)[:, None]
-    index = (y0 * width + x0).long().reshape(len(image), 1, -1).expand(-1, image.shape[1], -1)
-    flat = image.flatten(2)
+    # Of a network that has diverged: no place in the image.
+    normalised = grid.nan_to_num() * grid.new_tensor([2 / (width - 1), 2 / (height - 1)]) - 1
+    return functional.grid_sample(image, normalised, align_corners=True, padding_mode="border")
 
-    def corner(offset: int) -> Tensor:
-        return torch.gather(flat[..., offset:], 2, index).reshape(*image.shape[:2], *grid.shape[1:3])
 
-    top_left, top_right, bottom_left, bottom_right = corner(0), corner(1), corner(width), corner(width + 1)
-    top, bottom = top_right - top_left, bottom_right - bottom_left
-    value_top = top_left + wx * top
-    value_bottom = bottom_left + wx * bottom
-    values = value_top + wy * (value_bottom - value_top)
-    gradients = torch.stack([top + wy * (bottom - top), value_bottom - value_top], dim=-1)
-    return values, gradients
+def sample_gradients(image: Tensor, grid: Tensor) -> Tensor:
+    """Derivatives (B, C, H', W', 2) of the samples by (x, y); at a pixel's centre those to its right and below.
+
+    Along x it is the difference of two neighbours, blended along y, and the other way round.
+    Source: paper, equations 2 and 3 (the sub-gradients of a spatial transformer).
+    """
+    height, width = image.shape[-2:]
+    x, y = grid.unbind(-1)
+    left, top = x.floor().clamp(0, width - 2), y.floor().clamp(0, height - 2)
+    along_x = sample(image.diff(dim=-1), torch.stack([left, y], dim=-1))
+    along_y = sample(image.diff(dim=-2), torch.stack([x, top], dim=-1))
+    return torch.stack([along_x, along_y], dim=-1)
 
 
 @dataclass(frozen=True)
 class PhotometricError:
     """The error of one warp.
 
-    error (B,); warped (B, C, H, W), the reconstruction; and of what the Jacobian is made, detached:
-    residual (B, C, H, W), gradients (B, C, H, W, 2), visible (B, H, W) and the errors' n widths.
+    error (B,); warped (B, C, H, W), the reconstruction; and of what the Jacobian is made, detached: the image that was
+    sampled, the grid (B, H, W, 2), residual (B, C, H, W), visible (B, H, W) and the errors' n widths.
     """
 
     error: Tensor
     warped: Tensor
+    sampled: Tensor
+    grid: Tensor
     residual: Tensor
-    gradients: Tensor
     visible: Tensor
     widths: tuple[float, ...]
 
@@ -106,7 +104,7 @@ class PhotometricError:
 
         Closed form, (d e / d r) . (d r / d grid); made when asked for, since the last level's poses need none.
         """
-        seen = self.gradients * self.visible[:, None, ..., None]
+        seen = sample_gradients(self.sampled, self.grid) * self.visible[:, None, ..., None]
         slopes = [d_error_d_residual(self.residual, width) for width in self.widths]
         return torch.cat([(slope[..., None] * seen).sum(1) for slope in slopes], dim=-1).permute(0, 3, 1, 2)
 
@@ -131,7 +129,7 @@ def photometric_error(
     with those c.
     """
     grid, visible = project(depth, K, pose)
-    warped, gradients = sample(sampled, grid)
+    warped = sample(sampled, grid)
     residual = warped - reference
     squared = residual.square().sum(1)
     pixel_error = torch.sqrt(squared + charbonnier**2) - charbonnier if charbonnier > 0 else squared
@@ -140,7 +138,7 @@ def photometric_error(
     lost = has_depth - visible.sum((1, 2))
     error = ((pixel_error * visible).sum((1, 2)) + lost_error * lost) / has_depth
     widths = jacobian_widths or (charbonnier,)
-    return PhotometricError(error, warped, residual.detach(), gradients.detach(), visible, widths)
+    return PhotometricError(error, warped, sampled, grid.detach(), residual.detach(), visible, widths)
 
 
 def d_error_d_residual(residual: Tensor, charbonnier: float) -> Tensor:

@@ -42,8 +42,8 @@ def test_what_comes_back_is_better_on_held_out_pairs_and_says_by_how_much() -> N
 
 
 def test_weights_that_nothing_improves_stay_as_they_were_and_it_ends_early(capsys: pytest.CaptureFixture[str]) -> None:
-    """Steps that grow to a size of 1 destroy any network."""
-    destroying = dataclasses.replace(QUICK, steps=50, learning_rate=10.0, check_every=8, patience=2)
+    """Steps of a size of thousands destroy any network."""
+    destroying = dataclasses.replace(QUICK, steps=50, learning_rate=1e6, check_every=8, patience=2)
     adapted = fine_tune(WEIGHTS, pairs(), destroying)
     assert adapted.steps == 0
     assert adapted.after == adapted.before

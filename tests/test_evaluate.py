@@ -77,6 +77,7 @@ def test_baselines_are_of_the_same_pairs_and_timed_in_the_same_run(tmp_path: Pat
         assert row["seconds_per_pair"] > 0
         assert row["cpu_seconds_per_pair"] > 0
     assert found["threads"]["torch"] >= 1
+    assert found["agreement"] is None  # with nothing
 
 
 def test_the_classical_odometry_gets_the_frames_of_every_pair_in_order(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,7 +66,8 @@ def test_geometry_and_pose_layers_stay_in_float32(model: VIOLearner) -> None:
     fast = for_inference(model)
     found = estimate(fast, batch(model.config))
     assert {p.dtype for p in (*found.poses, *found.errors, found.hypotheses, found.warped)} == {torch.float32}
-    parts = (*fast.refinements, *fast.hypotheses, fast.gyro_pathway, fast.accelerometer_pathway)
+    heads = [pathway[-1] for pathway in (*fast.refinements, *fast.hypotheses)]
+    parts = (*heads, fast.gyro_pathway, fast.accelerometer_pathway)
     assert {p.dtype for part in parts for p in part.parameters()} == {torch.float32}
 
 

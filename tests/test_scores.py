@@ -4,7 +4,8 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from learned.scores import mean_motion, mean_poses, score
+from fusion_io.records import FloatArray
+from learned.scores import agreement, mean_motion, mean_poses, score
 
 
 def _poses(count: int, size: float, seed: int = 0) -> np.ndarray:
@@ -69,3 +70,30 @@ def test_the_mean_moves_with_the_frames_in_which_the_poses_are_given() -> None:
 def test_a_weight_of_one_alone_chooses_its_pose() -> None:
     T = _poses(6, 0.4).reshape(2, 3, 4, 4)
     assert_allclose(mean_poses(T, np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 5.0]])), T[[0, 1], [1, 2]], atol=1e-12)
+
+
+def test_what_two_estimates_share_is_the_references_error() -> None:
+    """Known errors of three independent sources are found again from the distances between them, to 5 %."""
+    rng = np.random.default_rng(3)
+
+    def off(rotation_rad: float, translation_m: float) -> FloatArray:
+        twist = rng.normal(size=(4000, 6)) * np.repeat([rotation_rad, translation_m], 3)
+        return np.asarray((true * RigidTransform.from_exp_coords(twist)).as_matrix())
+
+    true = RigidTransform.from_exp_coords(0.1 * rng.normal(size=(4000, 6)))
+    one, other, reference = off(1e-3, 0.01), off(2e-3, 0.02), off(4e-3, 0.05)
+    found = agreement(one, other, reference)
+    root = np.sqrt(3)
+    assert_allclose(found["shared_rotation_rad"], 4e-3 * root, rtol=0.05)
+    assert_allclose(found["shared_translation_m"], 0.05 * root, rtol=0.05)
+    assert_allclose(found["apart_rotation_rad"], np.hypot(1e-3, 2e-3) * root, rtol=0.05)
+    assert_allclose(found["apart_translation_m"], np.hypot(0.01, 0.02) * root, rtol=0.05)
+
+
+def test_where_the_reference_is_exact_nothing_is_shared() -> None:
+    rng = np.random.default_rng(4)
+    one, other = (RigidTransform.from_exp_coords(0.01 * rng.normal(size=(50, 6))).as_matrix() for _ in range(2))
+    exact = np.tile(np.eye(4), (50, 1, 1))
+    found = agreement(one, other, exact)
+    assert found["shared_translation_m"] < 0.5 * found["apart_translation_m"]
+    assert agreement(one, exact, exact)["shared_translation_m"] == 0.0
