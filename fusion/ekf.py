@@ -20,7 +20,8 @@ What a filter learns late, of scale or gravity, moves its position by what it go
 whose past stays where it was must not jump by that: its positions are the sum of the motions as they were known when
 they happened (the trail), and the covariance of that sum is carried along exactly, as that of a state which no update
 moves; so is that of the camera's pose at the last keyframe (Schmidt, "Application of state-space methods to navigation
-problems", 1966).
+problems", 1966). The turn of the world where nothing measured the motion, and the direction was lost, is such a state,
+too; to first order, so that positions far from there err along the line to it by more than is said.
 
 For the same reason the scale error of the front end is only considered: it widens the covariance, and accelerations do
 not estimate it. What they tell of it within seconds is little beside gravity and their own bias.
@@ -56,6 +57,9 @@ GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the acceler
 # rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz): so much that a prediction is worth nothing beside any pair.
 ANY_MOTION = 1e3, 2e5
 
+LOST = 0.5  # rad: a step whose turn nothing measured to that is an extrapolation
+UNKNOWN_TURN = np.pi / np.sqrt(3.0)  # rad: of an angle that may be any
+
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
@@ -65,9 +69,10 @@ EXTRINSICS, MOUNTED = slice(21, 28), slice(21, 31)
 CLONE_ATTITUDE, CLONE_POSITION = slice(31, 34), slice(34, 37)
 DIMENSION = 37
 
-# Where the errors of the past stand: of the IMU's position on the trail, and of the camera's pose at the last keyframe.
-TRAIL, KEYFRAME = slice(0, 3), slice(3, 9)
-PAST = 9
+# Where the errors of the past stand: of the IMU's position on the trail, of the camera's pose at the last keyframe, and
+# how the world has turned where the direction was lost.
+TRAIL, KEYFRAME, TURN = slice(0, 3), slice(3, 9), slice(9, 12)
+PAST = 12
 
 # Two small turns of Q move its third column so: Exp(x, y, 0) e3 = e3 + TILT (x, y).
 TILT = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
@@ -219,6 +224,11 @@ def inject(state: State, error: FloatArray) -> State:
     )
 
 
+def turning_sigma(covariance: FloatArray) -> float:
+    """The standard deviation (rad) of a pair's rotation about its worst axis, from its covariance (6, 6)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+
+
 def reset_jacobian(error: FloatArray) -> FloatArray:
     """(37, 37): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
     G = np.eye(DIMENSION)
@@ -299,6 +309,7 @@ class Filter:
         tie[POSITION, EXTRINSICS] = tie[CLONE_POSITION, EXTRINSICS] = R @ by_extrinsics[3:]
         self.kf.P = tie @ P @ tie.T
         self.trail = p  # of the IMU
+        self.lost_at = p
         self.past_covariance = np.zeros((PAST, PAST))  # of what no update moves
         self.past_covariance[TRAIL, TRAIL] = self.kf.P[POSITION, POSITION]
         self.past_cross = np.zeros((PAST, DIMENSION))  # with the error of the state
@@ -389,6 +400,31 @@ class Filter:
         self.kf.P = copy @ self.kf.P @ copy.T
         self.past_cross = self.past_cross @ copy.T
 
+    def lose_direction(self, measured: Measurement) -> None:
+        """Move on by a motion that is no more than an extrapolation, after which it is unknown which way the world is.
+
+        No linear update bears an attitude that is uncertain by about a radian, and none need: what was known of the
+        world turns about the present position by one unknown rotation, which no measurement feels. It widens the
+        covariances of the poses that follow. Gravity is looked for anew.
+        """
+        state, to_imu = self.state, self.state.T_camera_imu
+        moved = inverse(to_imu) @ measured.motion @ to_imu
+        F, by_noise, variances = np.eye(DIMENSION), np.eye(DIMENSION), np.zeros(DIMENSION)
+        F[ATTITUDE, ATTITUDE] = moved[:3, :3].T
+        F[POSITION, ATTITUDE] = -state.R @ skew(moved[:3, 3])
+        variances[POSITION] = measured.covariance[3:, 3:].trace() / 3
+        self.state = replace(state, R=state.R @ moved[:3, :3], p=state.p + state.R @ moved[:3, 3])
+        self._spread(F[None], by_noise[None], variances[None], 0.0, np.array([measured.seconds]))
+        self._drift(measured.seconds)
+        self.knows_gravity = False
+        # What an earlier loss did to the position until here stays with it; from here on the turns are one.
+        settled = np.eye(PAST)
+        settled[TRAIL, TURN] = -skew(self.trail - self.lost_at)
+        self.past_covariance = settled @ self.past_covariance @ settled.T
+        self.past_covariance[TURN, TURN] += min(turning_sigma(measured.covariance), UNKNOWN_TURN) ** 2 * np.eye(3)
+        self.past_cross = settled @ self.past_cross
+        self.lost_at = self.trail
+
     def forget_velocity(self) -> None:
         """Make the velocity as uncertain as at first, and independent of all else."""
         self._renew_velocity(self.config.velocity_sigma**2)
@@ -435,7 +471,7 @@ class Filter:
         self.past_covariance, self.past_cross = covariance, cross
 
     def _camera(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The camera's pose (4, 4) on the trail, and how it changes with the state (6, 37) and the past (6, 9)."""
+        """The camera's pose (4, 4) on the trail, and how it changes with the state (6, 37) and the past (6, 12)."""
         state = self.state
         on_trail = pose(state.R, self.trail)[None]
         cameras, by_pose, by_extrinsics = camera(on_trail, state.T_camera_imu, state.twist[None], state.ahead_s)
@@ -443,6 +479,7 @@ class Filter:
         by_state[:, ATTITUDE] = by_pose[0, :, :3]
         by_state[:, EXTRINSICS] = by_extrinsics[0]
         by_past[:, TRAIL] = by_pose[0, :, 3:] @ state.R.T
+        by_past[:, TURN] = by_pose[0, :, :3] @ state.R.T - by_past[:, TRAIL] @ skew(self.trail - self.lost_at)
         return cameras[0], by_state, by_past
 
     def _present(self, by_state: FloatArray, by_past: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -471,10 +508,19 @@ class Filter:
         self._spread(jacobians, by_noise, variances, self.config.accelerometer_noise, window.durations)
 
     def _look_down(self, window: ImuWindow) -> None:
-        """Take gravity's direction from the first accelerations: an accelerometer at rest shows what holds it up."""
+        """Take gravity's direction from the next accelerations: an accelerometer at rest shows what holds it up.
+
+        It errs as the attitude does, and by what they held beside gravity.
+        """
         down = -self.state.R @ (window.durations @ window.linear_acceleration)
         rotation, _ = Rotation.align_vectors(down[None], [[0.0, 0.0, 1.0]])
         self.state = replace(self.state, Q=rotation.as_matrix())
+        taken = np.eye(DIMENSION)
+        taken[GRAVITY_DIRECTION] = 0.0
+        taken[GRAVITY_DIRECTION, ATTITUDE] = (self.state.Q.T @ self.state.R)[:2]
+        self.kf.P = taken @ self.kf.P @ taken.T
+        self.kf.P[GRAVITY_DIRECTION, GRAVITY_DIRECTION] += self.config.gravity_sigma**2 * np.eye(2)
+        self.past_cross = self.past_cross @ taken.T
         self.knows_gravity = True
 
     def _predict_by_constancy(self, seconds: float) -> None:
@@ -552,20 +598,12 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
         pair = Measurement(motion, step.covariance + _by_stamps(step, config.stamp_jitter_s), step.duration_s)
         if calibration is not None and np.any(_during(calibration.bias_steps_ns, step)):
             ekf.doubt_gyro_bias(calibration.gyro_bias_std)
-        before = ekf.state, ekf.kf.P, ekf.past_cross
-        ekf.predict(window, pair.seconds)
-        innovation, nis = ekf.squared_innovation(pair)
-        used = nis <= gate or in_a_row >= config.max_rejected_in_a_row
-        if nis <= gate:
-            in_a_row = 0
-        elif used:  # so many cannot all be wrong: it is the prediction that is
-            ekf.state, ekf.kf.P, ekf.past_cross = before
-            ekf.forget_velocity()
-            ekf.predict(None, pair.seconds)
+        lost = calibration is not None and window is None and turning_sigma(pair.covariance) > LOST
+        if lost:
+            ekf.lose_direction(pair)
+            innovation, nis, used = np.full(6, np.nan), np.nan, True
         else:
-            in_a_row += 1
-        if used:
-            ekf.update(pair)
+            innovation, nis, used, in_a_row = _measure(ekf, pair, window, gate, in_a_row)
         if stands and used:
             ekf.stand_still()
         if window is None:
@@ -589,6 +627,30 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
         mounting=ekf.mounting() if calibration is not None else None,
         hindsight=closures.hindsight() if np.any(closures.used) else None,
     )
+
+
+def _measure(
+    ekf: Filter, pair: Measurement, window: ImuWindow | None, gate: float, in_a_row: int
+) -> tuple[FloatArray, float, bool, int]:
+    """Predict a frame and correct it by its pair, unless that is an outlier.
+
+    in_a_row: how many pairs before it were. Returns innovation (6,), its square, whether it was used, and in_a_row.
+    """
+    before = ekf.state, ekf.kf.P, ekf.past_cross
+    ekf.predict(window, pair.seconds)
+    innovation, nis = ekf.squared_innovation(pair)
+    if nis > gate:
+        in_a_row += 1
+        if in_a_row <= ekf.config.max_rejected_in_a_row:
+            return innovation, nis, False, in_a_row
+        # So many cannot all be wrong: it is the prediction that is.
+        ekf.state, ekf.kf.P, ekf.past_cross = before
+        ekf.forget_velocity()
+        ekf.predict(None, pair.seconds)
+    else:
+        in_a_row = 0
+    ekf.update(pair)
+    return innovation, nis, True, in_a_row
 
 
 def _during(stamps_ns: IntArray, step: PairEstimate) -> NDArray[np.bool_]:

@@ -216,6 +216,14 @@ class WithTrail(Filter):
         self.joint[ekf.VELOCITY, ekf.VELOCITY] = variance * np.eye(3)
         super()._renew_velocity(variance)
 
+    def _look_down(self, window: ImuWindow) -> None:
+        super()._look_down(window)
+        taken = np.eye(46)
+        taken[ekf.GRAVITY_DIRECTION] = 0.0
+        taken[ekf.GRAVITY_DIRECTION, ekf.ATTITUDE] = (self.state.Q.T @ self.state.R)[:2]
+        self.joint = taken @ self.joint @ taken.T
+        self.joint[ekf.GRAVITY_DIRECTION, ekf.GRAVITY_DIRECTION] += self.config.gravity_sigma**2 * np.eye(2)
+
     def clone(self) -> None:
         copy = np.eye(46)
         copy[37:40, ekf.POSITION] += np.eye(3)
@@ -228,7 +236,7 @@ class WithTrail(Filter):
     def keep(self) -> None:
         _, by_state, by_past = self._camera()
         become = np.eye(46)
-        become[40:] = np.hstack([by_state, by_past])
+        become[40:] = np.hstack([by_state, by_past[:, :9]])
         self.joint = become @ self.joint @ become.T
         super().keep()
 
@@ -245,8 +253,9 @@ def test_the_covariance_of_the_past_is_that_of_explicit_schmidt_states(monkeypat
     assert result.rejected == 1
     (found,) = filters
     assert_allclose(found.kf.P, found.joint[:37, :37], rtol=1e-6, atol=1e-12)
-    assert_allclose(found.past_cross, found.joint[37:, :37], rtol=1e-6, atol=1e-12)
-    assert_allclose(found.past_covariance, found.joint[37:, 37:], rtol=1e-6, atol=1e-12)
+    assert_allclose(found.past_cross[:9], found.joint[37:, :37], rtol=1e-6, atol=1e-12)
+    assert not np.any(found.past_covariance[ekf.TURN])  # no direction was lost
+    assert_allclose(found.past_covariance[:9, :9], found.joint[37:, 37:], rtol=1e-6, atol=1e-12)
     assert not np.allclose(
         found.past_covariance[ekf.TRAIL, ekf.TRAIL], found.kf.P[ekf.POSITION, ekf.POSITION], rtol=0.05
     )
@@ -519,6 +528,59 @@ def test_a_hole_in_the_pairs_is_crossed_by_the_imu() -> None:
     true = drive.truth.poses[50].inv() * drive.truth.poses[60]
     assert np.linalg.norm((crossed.inv() * true).translation) < 0.6
     assert (crossed.inv() * true).rotation.magnitude() < 0.01
+
+
+@pytest.mark.parametrize("off_rad", [0.0, 1.0, 2.5])
+def test_after_a_hole_in_everything_the_direction_is_lost_and_what_follows_is_honest(off_rad: float) -> None:
+    """Three seconds that nothing measured, bridged by a motion that is off: errors stay within their covariances.
+
+    Those of positions as far as first order reaches. What is measured afterwards is known as well as ever.
+    """
+    drive = _drive()
+    steps, true = drive.measurements.steps, drive.truth.poses[40].inv() * drive.truth.poses[70]
+    motion = true * RigidTransform.from_exp_coords(np.array([0.3, 0.9, -0.3, 3.0, 1.0, -2.0]) * off_rad)
+    unknown = replace(
+        steps[40],
+        target_stamp_ns=steps[69].target_stamp_ns,
+        quat_wxyz=motion.rotation.as_quat(scalar_first=True),
+        translation=motion.translation,
+        covariance=np.diag(np.repeat([25.0, 100.0], 3)),
+    )
+    found = _solve(drive, [*steps[:40], unknown, *steps[70:]], _without(drive, 3.99, 7.01)).trajectory
+    assert found.covariances is not None
+    after, truth = found.poses[41:], drive.truth.poses[70:]
+    errors = pose_errors(after, truth)
+    for error, part in zip(errors, (slice(3, 6), slice(0, 3)), strict=True):
+        squares = [_squared(*each) for each in zip(error, found.covariances[41:, part, part], strict=True)]
+        assert max(squares) < chi2.isf(1e-3, 3) or (off_rad > 2.0 and part.start == 3)
+    assert np.min(np.linalg.eigvalsh(found.covariances[41:, :3, :3])) > 0.9 * ekf.UNKNOWN_TURN**2
+    whole = _solve(drive).trajectory.poses[70:]
+    off, usual = ((each[0].inv() * each[-1]).inv() * truth[0].inv() * truth[-1] for each in (after, whole))
+    assert np.linalg.norm(off.translation) < 1.2 * np.linalg.norm(usual.translation)
+    assert off.rotation.magnitude() < 1.2 * usual.rotation.magnitude()
+
+
+def test_what_a_lost_direction_does_to_a_pose_equals_finite_differences() -> None:
+    """Losses one after the other: each turns what follows it about where it happened."""
+    rng, lost, centres = np.random.default_rng(2), _filter(), 10.0 * np.random.default_rng(3).normal(size=(2, 3))
+    lost.past_covariance[:] = 0.0
+    for centre in centres:
+        lost.trail = centre
+        lost.lose_direction(Measurement(np.eye(4), 4.0 * np.eye(6), 1.0))
+    lost.trail = 10.0 * rng.normal(size=3)
+    T, _, by_past = lost._camera()
+    by_turns = []
+    for centre in centres:
+        columns = []
+        for axis in np.eye(3):
+            turn = RigidTransform.from_rotation(Rotation.from_rotvec(STEP * axis))
+            moved = RigidTransform.from_translation(centre) * turn * RigidTransform.from_translation(-centre)
+            columns.append(
+                (RigidTransform.from_matrix(T).inv() * moved * RigidTransform.from_matrix(T)).as_exp_coords()
+            )
+        by_turns.append(np.stack(columns, axis=1) / STEP)
+    expected = sum(ekf.UNKNOWN_TURN**2 * J @ J.T for J in by_turns)
+    assert_allclose(by_past @ lost.past_covariance @ by_past.T, expected, rtol=1e-4, atol=1e-3)
 
 
 def test_the_same_input_gives_the_same_bits() -> None:
