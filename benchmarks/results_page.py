@@ -144,9 +144,10 @@ REMARKS = {
     "published": """\
 A real system's odometry on KITTI 09, which stands in for a front end, with the real IMU of 100 Hz. The mounting and the
 time offset are estimated from the log alone and compared with a fit of the same kind to the rotations of the ground
-truth. What is left between the two is what the odometry's own errors feign: it is several of its stated standard
-deviations. The noise of the accelerometer and the time over which errors of a front end are correlated were chosen with
-this log and those of the next section in view, so that their figures are a little better than those of a new log.""",
+truth. What is left of the time offset is the odometry's: its own turning is ahead of the truth's by as much, slow or
+fast (below), which nothing in the log tells from an offset of the IMU. The noise of the accelerometer and the time over
+which errors of a front end are correlated were chosen with this log and those of the next section in view, so that
+their figures are a little better than those of a new log.""",
     "noise": """\
 True poses with the errors of a learned front end (`convert trajectory --noise-seed`): rotation, about each axis, 0.011
 deg that fade by 1 % from pair to pair and white 0.05 deg; translation, 0.8 % of it that fade likewise and white 5, 2
@@ -156,7 +157,8 @@ small and t_rel is not.""",
     "revisit": """\
 The last frames of 09 meet its start. Each of them is tied to the nearest early frame by its true relative pose, with a
 noise of 0.15 m and 0.3 deg for each axis that differs by seed, recorded in the log as `/violearner/loops`. The filter
-is causal: a loop moves its present alone, and in hindsight (smoothed) the way there.""",
+is causal: a loop moves its present alone, and in hindsight (smoothed) the way there. As the loops come with the last
+25 of 1591 frames, nothing that is causal can lower the ATE by much: the other poses were said before.""",
     "rendered": """\
 Streets are simulated along the real trajectories, with depth from stereo and moving cars, and the real IMU. The network
 estimates the pairs, and loops are looked for in the images. Loops are wrong that are more than 0.5 m or 2 deg off. The
@@ -170,5 +172,6 @@ Drive 0039 has an IMU of 10 Hz. The clip of 06 is 50 frames of an almost straigh
 in by interpolation and is not used; where too little is left, the IMU is left out and the pose graph equals raw.""",
     "timing": """\
 Loops between true poses as above, on the longest sequence; wall-clock time of one solution with all covariances, on the
-machine that made this page.""",
+machine that made this page. An iteration linearises 10,500 factors of 10,000 variables and solves for them; the
+covariances of all poses and states take as long as two.""",
 }
