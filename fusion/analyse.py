@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.command import STANDARD_OUTPUT, answered, role_and_topic, write_json, write_text
-from fusion_io.errors import EXIT_DAMAGED, EXIT_OK
+from fusion_io.command import STANDARD_OUTPUT, answered, command_parser, role_and_topic, write_json, write_text
+from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK
+from fusion_io.words import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,6 +44,8 @@ def run(log_path: Path, topics: dict[str, str], json_path: Path | None, html_pat
         write_json(json_path, document(analysis))
     if json_path != STANDARD_OUTPUT:
         _print(analysis)
+    if not analysis.usable:
+        return EXIT_FAILED
     return EXIT_DAMAGED if analysis.damaged else EXIT_OK
 
 
@@ -52,17 +55,21 @@ def _print(analysis: Analysis) -> None:
     from rich.text import Text
 
     from fusion.analysis_tables import tables
+    from fusion.placement import placement
 
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     path = analysis.found.path
     console.print(Text(f"{path.name}: {analysis.answer}", style=STYLES[analysis.answer]))
     for reason in analysis.reasons:
-        console.print(Text(f"  {reason.level.name.lower()}: {reason.line(str(path))}"))
+        # Whoever reads it may copy a command from it: no line breaks of ours.
+        console.print(Text(f"  {reason.level.name.lower()}: {reason.line(str(path))}"), soft_wrap=True)
     if (calibration := analysis.found.calibration) is not None and calibration.used:
-        console.print(Text(f"IMU by the pair estimates: {calibration.reason}"))
+        known = placement(calibration, None)
+        console.print(Text(f"IMU by the pair estimates: {calibration.reason}; {known.summary}"))
     if analysis.revisits is not None:
         seen = analysis.revisits
-        console.print(Text(f"Loop candidates by {seen.source}: {seen.frames} frames in {seen.stretches} stretches"))
+        stretches = counted(seen.stretches, "stretch", "stretches")
+        console.print(Text(f"Loop candidates by {seen.source}: {counted(seen.frames, 'frame')} in {stretches}"))
     for table in tables(analysis):
         _print_table(console, table)
 
@@ -82,10 +89,11 @@ def _print_table(console: Console, table: PlainTable) -> None:
 
 def parser() -> argparse.ArgumentParser:
     """The options of the command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion.analyse",
-        description="Say whether a log is good enough to run, and why: times, light, depth, noise, faults, results.",
-        epilog="Exit codes: 0 analysed, whatever the verdict; 1 nothing could be read, 2 usage, 3 the log is damaged.",
+    parser = command_parser(
+        "fusion.analyse",
+        "Say whether a log is good enough to run, and why: times, light, depth, noise, faults, results.",
+        "Exit codes: as a run on it would have, 0 ready or usable with limits, 1 not usable or not readable, 2 usage, "
+        "3 usable, but damaged.",
     )
     parser.add_argument("log", type=Path, metavar="LOG.mcap", help="any MCAP file, an input or an output")
     parser.add_argument(

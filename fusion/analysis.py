@@ -18,8 +18,11 @@ from fusion.evaluation import evaluate
 from fusion.events import Event
 from fusion.imu import ImuCalibration, calibrate
 from fusion.log_statistics import DepthStatistics, ImageStatistics, ImuStatistics, Revisits, TopicStatistics
+from fusion.placement import placement
+from fusion_io import encodings, roles, topics
 from fusion_io.container import Contents
 from fusion_io.errors import LogError
+from fusion_io.odometry import POSE_TYPES
 from fusion_io.progress import track
 from fusion_io.reader import Log
 from fusion_io.records import NANOSECONDS, ImuSeries, IntArray, PairEstimate, Trajectory
@@ -74,6 +77,11 @@ class Analysis:
         return verdict.answer(self.reasons)
 
     @property
+    def usable(self) -> bool:
+        """Whether nothing stands in the way of a run."""
+        return self.answer != verdict.ANSWERS[verdict.Level.BLOCKS]
+
+    @property
     def span_ns(self) -> tuple[int, int]:
         """First and last time of all topics."""
         topics = self.found.topics.values()
@@ -91,7 +99,7 @@ def analyse(path: Path, chosen: Mapping[str, str]) -> Analysis:
     """
     contents = scan(path, lambda channel: True)
     survey = Survey(path, contents)
-    topics = {
+    statistics = {
         topic: log_statistics.of_topic(channel, survey.kinds[topic], survey.times(topic))
         for topic, channel in survey.channels.items()
     }
@@ -121,25 +129,48 @@ def analyse(path: Path, chosen: Mapping[str, str]) -> Analysis:
     found = verdict.Found(
         path=path,
         refusal=refusal or seen.refusal,
-        faults=_damage(path, contents) if log is None else [note for note in log.notes if note not in log.remarks],
+        faults=contents.faults(path) if log is None else [note for note in log.notes if note not in log.remarks],
         remarks=[] if log is None else log.remarks,
         roles={} if log is None else log.roles,
-        topics=topics,
+        topics=statistics,
         images={topic: each for topic, each in images.items() if each},
         depths={topic: each for topic, each in depths.items() if each},
         imus=imus,
         events=events.in_order([*found_events, *seen.events]),
         calibration=seen.calibration,
+        trajectories=_trajectories(survey),
+        choices={role: _choices(survey, role) for role in roles.CANONICAL},
     )
     return Analysis(
         found=found,
         reasons=verdict.reasons(found),
-        damaged=bool(contents.damage or contents.messages_lost),
+        damaged=bool(contents.faults(path)),
         frames=0 if log is None else len(log.frame_stamps()),
         revisits=seen.revisits,
         recorded_loops=seen.recorded_loops,
         results=seen.results,
     )
+
+
+def _trajectories(survey: Survey) -> list[str]:
+    """The topics of odometry and poses, those with most messages first; neither the truth nor what a run wrote."""
+    counts = {
+        topic: len(survey.times(topic).log_times_ns)
+        for topic, channel in survey.channels.items()
+        if encodings.ros2_type(channel) in POSE_TYPES
+        and topic != topics.GROUND_TRUTH
+        and not topic.startswith(topics.ODOMETRY_PREFIX)
+    }
+    return sorted((topic for topic, count in counts.items() if count > 1), key=lambda topic: -counts[topic])
+
+
+def _choices(survey: Survey, role: str) -> list[str]:
+    """The topics that could be chosen for a role."""
+    return [
+        topic
+        for topic, channel in survey.channels.items()
+        if roles.could_play(role, topic, encodings.ros2_type(channel), survey.kinds[topic])
+    ]
 
 
 def _open(path: Path, contents: Contents, chosen: Mapping[str, str]) -> tuple[Log | None, str]:
@@ -148,11 +179,6 @@ def _open(path: Path, contents: Contents, chosen: Mapping[str, str]) -> tuple[Lo
         return Log(path, contents, chosen), ""
     except LogError as error:
         return None, str(error)
-
-
-def _damage(path: Path, contents: Contents) -> list[str]:
-    lost = [f"{path}: {contents.messages_lost} messages that it once held cannot be read"]
-    return [each.note for each in contents.damage] + (lost if contents.messages_lost else [])
 
 
 class _Seen:
@@ -370,12 +396,15 @@ def _noise(estimate: NoiseEstimate | None, stated_std: float | None) -> dict[str
 
 
 def _calibration(calibration: ImuCalibration) -> dict[str, Any]:
-    rotation = calibration.rotation_imu_camera
+    known = placement(calibration, None)
+    rotation, std_rad = known.rotation_imu_camera, known.rotation_std_rad
     return {
         "used": calibration.used,
         "reason": calibration.reason,
         "rotation_imu_camera_quat_wxyz": None if rotation is None else rotation.as_quat(scalar_first=True).tolist(),
-        "time_offset_s": calibration.time_offset_s,
+        "rotation_std_deg": None if std_rad is None else np.rad2deg(std_rad).tolist(),
+        "time_offset_s": known.time_offset_s,
+        "time_offset_std_s": known.time_offset_std_s,
         "gyro_bias_rad_s": calibration.gyro_bias.tolist(),
     }
 

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import NoReturn
 
-from fusion_io.command import answered
+from fusion_io.command import answered, called_as
 from fusion_io.errors import EXIT_OK, UsageError
 
 COMMANDS = {
@@ -51,7 +51,8 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         near = get_close_matches(name, [*COMMANDS, "completion"], n=1, cutoff=0.0)
         raise UsageError(f"there is no command {name!r}; did you mean {near[0]!r}? See violearner --help")
-    code: int = import_module(COMMANDS[name][0]).main(arguments)
+    with called_as(f"violearner {name}"):
+        code: int = import_module(COMMANDS[name][0]).main(arguments)
     return code
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from fusion_io.command import STANDARD_OUTPUT, answered, write_json, write_text
+from fusion_io.command import STANDARD_OUTPUT, answered, command_parser, write_json, write_text
 from fusion_io.errors import EXIT_DAMAGED, EXIT_DIFFERS, EXIT_OK
 
 if TYPE_CHECKING:
@@ -97,13 +97,14 @@ def measures_table(compared: Comparison) -> Table:
     table.add_column("")
     table.add_column("")
     shown = [column for column in _COLUMNS if any(_value(each, column[0]) is not None for each in _all(compared))]
+    best = {key: compared.best(key) for key, *_ in shown}
     for _, heading, unit, _, _ in shown:
         table.add_column(f"{heading}\n{unit}", justify="right", no_wrap=True)
     for result in compared.results:
         for each in contestants(result):
             metrics = compared.metrics[each.name]
             cells = [
-                _cell(_value(metrics, key), decimals, factor, best=_is_best(compared, metrics, key))
+                _cell(_value(metrics, key), decimals, factor, best=each.name in best[key])
                 for key, _, _, decimals, factor in shown
             ]
             table.add_row(Text(f"{result.key}  {result.label}"), _heading(each.trajectory), *cells)
@@ -179,15 +180,6 @@ def _value(metrics: Metrics, key: str) -> float | None:
     return value
 
 
-def _is_best(compared: Comparison, metrics: Metrics, key: str) -> bool:
-    """Whether no trajectory is closer to what is right."""
-    from fusion.comparison import badness
-
-    values = [badness(key, value) for each in _all(compared) if (value := _value(each, key)) is not None]
-    own = _value(metrics, key)
-    return own is not None and badness(key, own) == min(values)
-
-
 def _cell(value: float | None, decimals: int, factor: float, best: bool = False) -> Text:
     from rich.text import Text
 
@@ -205,7 +197,9 @@ def _heading(name: str) -> str:
 
 def _legend(console: Console, compared: Comparison) -> None:
     if _has_truth(compared):
-        lines = ["Lower is better; an ANEES of 3 is right."]
+        from fusion.table import ANEES_RULE
+
+        lines = [f"Lower is better; {ANEES_RULE}."]
         if compared.duels:
             lines.append("Differences are paired over segments: negative where the second has the smaller error.")
     else:
@@ -226,11 +220,10 @@ exit codes: 0 all well, 1 nothing could be compared, 2 usage, 3 compared from a 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion.compare",
-        description="Compare any number of runs and trajectories: which is better, where, and beyond the noise or not.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "fusion.compare",
+        "Compare any number of runs and trajectories: which is better, where, and beyond the noise or not.",
+        _EPILOG,
     )
     parser.add_argument(
         "inputs",

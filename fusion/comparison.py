@@ -11,11 +11,15 @@ import numpy as np
 from fusion.evaluation import KITTI_SEGMENT_LENGTHS_M, Metrics, SegmentErrors, evaluate, segment_errors
 from fusion.results import Result
 from fusion.significance import Difference, paired_difference
-from fusion_io.records import FloatArray, IntArray, Trajectory
+from fusion.table import best_of
+from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 
 SCHEMA = 1
 STRETCHES = 10
 """The path is divided into so many pieces, or fewer where the shortest segment does not fit into them."""
+
+SAME_TIME_S = 1.0
+"""Results whose ends are nearer than this cover the same time."""
 
 MEASURES = {"t_rel_percent": "translation_percent", "r_rel_deg_per_100m": "rotation_deg_per_100m"}
 """Measures that are means over segments, and the errors that they are the means of."""
@@ -102,6 +106,12 @@ class Comparison:
             for measure, value in asdict(metrics).items()
         }
 
+    def best(self, measure: str) -> set[str]:
+        """The names of the contestants that are nearest to what is right; none where all are equal."""
+        values = {name: getattr(metrics, measure) for name, metrics in self.metrics.items()}
+        distances = [None if value is None else badness(measure, value) for value in values.values()]
+        return {name for name, is_best in zip(values, best_of(distances), strict=True) if is_best}
+
 
 def compare(
     results: Sequence[Result], ground_truth: Trajectory | None = None, segment_lengths_m: Sequence[float] | None = None
@@ -129,6 +139,8 @@ def compare(
         else:
             also = "" if truth is None else " and the ground truth"
             notes.append(f"{a.name} and {b.name} are not compared: they{also} have no times in common")
+    if duels or deviations:
+        notes += _coverage(results)
     return Comparison(results, lengths, metrics, duels, deviations, notes)
 
 
@@ -213,6 +225,30 @@ def document(comparison: Comparison) -> dict[str, Any]:
         "deviations": [{"a": each.a.name, "b": each.b.name} | asdict(each.measures) for each in comparison.deviations],
         "notes": list(comparison.notes),
     }
+
+
+def _coverage(results: Sequence[Result]) -> list[str]:
+    """Which times each result covers, where they are not the same: then the measures are not of the same drive."""
+    spans_ns = np.array(
+        [
+            (
+                min(each.stamps_ns[0] for each in result.trajectories.values()),
+                max(each.stamps_ns[-1] for each in result.trajectories.values()),
+            )
+            for result in results
+        ]
+    )
+    if np.max(np.ptp(spans_ns, axis=0)) < SAME_TIME_S * NANOSECONDS:
+        return []
+    seconds = (spans_ns - spans_ns.min()) / NANOSECONDS
+    covered = [
+        f"{result.key} ({result.label}) {start:.1f} to {end:.1f} s"
+        for result, (start, end) in zip(results, seconds.tolist(), strict=True)
+    ]
+    return [
+        f"the inputs cover different times: {', '.join(covered)}; the measures of each are over its own time, "
+        "differences over the time that both cover"
+    ]
 
 
 def _duel_document(duel: Duel) -> dict[str, Any]:

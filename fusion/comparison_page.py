@@ -11,7 +11,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
-from fusion.comparison import MEASURES, Comparison, Contestant, Duel, badness, contestants
+from fusion.comparison import MEASURES, Comparison, Contestant, Duel, contestants
 from fusion.evaluation import common, segment_errors
 from fusion.results import ONLY_TRAJECTORY
 from fusion.significance import ROUNDING, Difference
@@ -99,11 +99,12 @@ def _notes(comparison: Comparison) -> Iterator[str]:
 
 def _measures(comparison: Comparison) -> Iterator[str]:
     rows = []
+    best = {row.key: comparison.best(row.key) for row in ROWS}
     known = [row for row in ROWS if any(getattr(each, row.key) is not None for each in comparison.metrics.values())]
     for result in comparison.results:
         for each in contestants(result):
             values = asdict(comparison.metrics[each.name])
-            cells = [_cell(comparison, row.key, values[row.key], row.scale, row.decimals) for row in known]
+            cells = [_cell(values[row.key], row.scale, row.decimals, best=each.name in best[row.key]) for row in known]
             rows.append(f"<tr><td>{escape(label(each))}</td><td class='word key'>{each.name}</td>{''.join(cells)}</tr>")
     heads = "".join(f"<th>{escape(row.label)}<br>{escape(row.unit)}</th>" for row in known)
     yield _table(f"<th></th><th class=key></th>{heads}", rows)
@@ -111,13 +112,10 @@ def _measures(comparison: Comparison) -> Iterator[str]:
         yield "<p>There is no ground truth, so nothing says which of them is better.</p>"
 
 
-def _cell(comparison: Comparison, key: str, value: float | None, scale: float, decimals: int) -> str:
+def _cell(value: float | None, scale: float, decimals: int, best: bool) -> str:
     if value is None:
         return "<td>-</td>"
-    values = [getattr(each, key) for each in comparison.metrics.values()]
-    least = min(badness(key, each) for each in values if each is not None)
-    best = " class=best" if badness(key, value) == least else ""
-    return f"<td{best}>{value * scale:.{decimals}f}</td>"
+    return f"<td{' class=best' if best else ''}>{value * scale:.{decimals}f}</td>"
 
 
 def _differences(comparison: Comparison) -> Iterator[str]:

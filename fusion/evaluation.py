@@ -12,10 +12,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import chi2
 
 from fusion_io.records import FloatArray, IntArray, Trajectory
 
@@ -26,6 +27,15 @@ KITTI_START_EVERY_FRAMES = 10
 # A standard deviation below a micrometre or a microradian claims nothing: it marks the pose that defines the world.
 MIN_VARIANCE = 1e-12
 
+ANEES_DIMENSIONS = 3
+"""Of position, and of orientation: the ANEES of a covariance that is right."""
+
+CONFIDENCE = 0.95
+INDEPENDENT_ERRORS = 10
+"""Errors of odometry are correlated in time: those of a run tell about as much as so many independent ones."""
+
+Consistency = Literal["overconfident", "consistent", "timid"]
+
 
 @dataclass(frozen=True, slots=True)
 class Metrics:
@@ -34,7 +44,7 @@ class Metrics:
     t_rel_percent, r_rel_deg_per_100m: KITTI devkit, over `segments` segments. ate_m: RMSE of position after SE(3)
     alignment of the whole trajectory. end_error_m: distance at the last frame with the first poses aligned.
     rpe_*: RMSE of the relative pose error between consecutive frames. anees_*: mean normalised squared error of 3
-    degrees of freedom; 3 is right, more is overconfident, less is timid.
+    degrees of freedom; 3 is right (`consistency`).
     """
 
     t_rel_percent: float | None = None
@@ -101,6 +111,26 @@ def evaluate(
         anees_position=anees_position,
         anees_orientation=anees_orientation,
     )
+
+
+def anees_bounds() -> tuple[float, float]:
+    """Between which the ANEES of a covariance that is right is expected with 95 %: 1.7 to 4.7.
+
+    By the chi-square distribution of `INDEPENDENT_ERRORS`. Outside, sigmas are off by more than a quarter.
+    """
+    low, high = chi2.interval(CONFIDENCE, INDEPENDENT_ERRORS * ANEES_DIMENSIONS)
+    return float(low) / INDEPENDENT_ERRORS, float(high) / INDEPENDENT_ERRORS
+
+
+def consistency(anees: float) -> Consistency:
+    """Whether errors are as large as was stated: the one rule for all that is shown."""
+    low, high = anees_bounds()
+    return "overconfident" if anees > high else "timid" if anees < low else "consistent"
+
+
+def errors_by_sigmas(anees: float) -> float:
+    """How many times the stated sigmas the errors are, by their root mean square; 1 is right."""
+    return float(np.sqrt(anees / ANEES_DIMENSIONS))
 
 
 def errors_over_time(estimate: Trajectory, ground_truth: Trajectory) -> ErrorSeries:

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from fusion import clocks, sensors
 from fusion.sensors import MAD_TO_STD, runs
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate, Trajectory
+from fusion_io.words import counted
 
 IMU_GAP = "IMU gap"
 STUCK = "sensor stuck"
@@ -95,7 +96,7 @@ def imu_gaps(stamps_ns: IntArray, topic: str) -> list[Event]:
 def dropped_frames(stamps_ns: IntArray, topic: str) -> list[Event]:
     """Where frames (N,) are missing from their rhythm."""
     return [
-        Event(start, end, DROPPED_FRAMES, topic, f"{missing} {'frame' if missing == 1 else 'frames'} missing")
+        Event(start, end, DROPPED_FRAMES, topic, f"{counted(missing, 'frame')} missing")
         for start, end, missing in _holes(stamps_ns, FRAME_HOLE_PERIODS)
     ]
 
@@ -274,7 +275,7 @@ def wrong_pairs(
         count = int(wrong[run].sum())
         why = " and ".join(reason for reason, found in reasons.items() if np.any(found[run]))
         start, end = pairs[run.start].source_stamp_ns, pairs[run.stop - 1].target_stamp_ns
-        text = f"{count} {'pair' if count == 1 else 'pairs'}: {why}"
+        text = f"{counted(count, 'pair')}: {why}"
         events.append(Event(start, end, WRONG_PAIR, topic, text))
     return in_order(events)
 

@@ -16,7 +16,7 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fusion_io.command import answered
+from fusion_io.command import answered, command_parser
 from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
@@ -48,17 +48,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(path: Path, images: Path | None, exports: Exports) -> int:
-    """Export one log, its images from another where that is given; returns the exit code.
+    """Export one log or the log in a run's folder, its images from another where given; returns the exit code.
 
     Raises UsageError for nothing to export to, and LogError for a log that cannot be read or a place to write to.
     """
+    from fusion.results import log_file
     from fusion_io.reader import open_log
 
     if exports == Exports():
         raise UsageError("nothing to export to: give --csv, --parquet or --rerun")
     checked(exports)
-    log = open_log(path)
-    export(log, open_log(images) if images else log, exports)
+    log = open_log(log_file(path))
+    export(log, open_log(log_file(images)) if images else log, exports)
     for note in log.notes:
         print(f"warning: {note}", file=sys.stderr)
     return EXIT_DAMAGED if log.damaged else EXIT_OK
@@ -249,12 +250,12 @@ def _writing(path: Path) -> Iterator[Path]:
 
 def parser() -> argparse.ArgumentParser:
     """The options of the command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion.export",
-        description="Export the time series of a log for pandas and others, and all of it for rerun.",
-        epilog="Exit codes: 0 all well, 1 nothing could be exported, 2 usage, 3 exported from a damaged log.",
+    parser = command_parser(
+        "fusion.export",
+        "Export the time series of a log for pandas and others, and all of it for rerun.",
+        "Exit codes: 0 all well, 1 nothing could be exported, 2 usage, 3 exported from a damaged log.",
     )
-    parser.add_argument("log", type=Path, metavar="RUN.mcap", help="the log, as fusion.run writes it or any other")
+    parser.add_argument("log", type=Path, metavar="RUN.mcap", help="the log of a run, its folder, or any other log")
     parser.add_argument("--images", type=Path, metavar="LOG.mcap", help="the log with the images (default: the same)")
     add_options(parser)
     return parser

@@ -70,7 +70,8 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
     """
     asked = back_ends(config)
     estimates: dict[str, Estimate] = {}
-    graph = _attempt("posegraph", known, config, findings) if "posegraph" in asked or known.imu else None
+    of_graph = findings if "posegraph" in asked else Findings()  # who did not ask for it is not told of it
+    graph = _attempt("posegraph", known, config, of_graph) if "posegraph" in asked or known.imu else None
     if graph is not None and "posegraph" in asked:
         estimates["posegraph"] = graph
     refined = replace(known, mounting=graph.mounting if graph else None)

@@ -26,6 +26,7 @@ from fusion.factors import Batch, GnssFactors, by_vector, extrinsics, padded, po
 from fusion.pair_model import skew
 from fusion_io.findings import Findings
 from fusion_io.records import LONGEST_INTERPOLATION_S, NANOSECONDS, FloatArray, GnssFix, IntArray, Trajectory
+from fusion_io.words import counted
 
 if TYPE_CHECKING:
     from fusion.posegraph import Problem, Solution
@@ -185,7 +186,7 @@ def _left_open(world_m: FloatArray, sigma_m: FloatArray, up: FloatArray | None) 
     About an axis they tell an angle as exactly as their distances from it are long in terms of sigma_m.
     """
     if len(world_m) < MIN_FIXES:
-        return f"{len(world_m)} fixes during the trajectory"
+        return f"{counted(len(world_m), 'fix', 'fixes')} during the trajectory"
     from_middle = world_m - np.average(world_m, axis=0, weights=sigma_m**-2)
     scaled = from_middle / sigma_m[:, None]
     across = scaled if up is None else scaled - np.outer(scaled @ up, up)

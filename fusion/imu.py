@@ -30,6 +30,7 @@ from scipy.stats import rankdata
 from fusion import clocks, sensors
 from fusion.chain import MAX_IMU_PERIODS
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate
+from fusion_io.words import counted
 
 # The search for the time offset, and how well angular rates must correlate (by rank) where it is right.
 MAX_TIME_OFFSET_S = 0.5
@@ -600,14 +601,10 @@ def _fit_problem(fit: _Fit, max_scale_error: float) -> str | None:
 
 
 def _summary(fit: _Fit, stretches: int, changes: Sequence[Change]) -> str:
-    """One line on what was estimated, how well, how many stretches of the IMU are faulty and what changed."""
-    rotation_std, offset_std = fit.std[ROTATION].max(), fit.std[OFFSET].max()
-    mounting = f"estimated to +-{np.rad2deg(rotation_std):.2f} deg" if rotation_std > 0.0 else "given"
-    deviation = f"+-{1e3 * offset_std:.1f} ms" if offset_std > 0.0 else "given"
-    offset = f"{1e3 * fit.time_offset_s:.1f} ms ({deviation})"
-    faulty = f"; left out in {stretches} faulty stretches" if stretches else ""
+    """One line on why the IMU is believed, how many stretches of it are faulty and what changed."""
+    faulty = f"; left out in {counted(stretches, 'faulty stretch', 'faulty stretches')}" if stretches else ""
     explained = f"its gyro explains {fit.explained[-1]:.1%} of the turning of {len(fit.predicted)} pairs"
     jumped = [f"; its clock jumps by {change.clock_ns / NANOSECONDS:+.2f} s" for change in changes if change.clock_ns]
     steps = [np.linalg.norm(change.bias) for change in changes if not change.clock_ns]
     stepped = [f"; its gyro's bias steps by {step:.2g} rad/s" for step in steps]
-    return f"{explained}; mounting {mounting}, time offset {offset}{faulty}{''.join(jumped + stepped)}"
+    return f"{explained}{faulty}{''.join(jumped + stepped)}"

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from fusion.evaluation import Metrics
 from fusion.gnss import Georeference
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Mounting
+from fusion.placement import Placement, placement, refined_mounting
 from fusion_io.errors import LogError, UsageError
 from fusion_io.findings import Findings
 from fusion_io.messages import CAMERA_FRAME
@@ -69,12 +71,12 @@ class Outcome:
     @property
     def mounting(self) -> Mounting | None:
         """How the IMU is mounted, as a back end has refined it, or None."""
-        return next((each.mounting for each in self.estimates.values() if each.mounting is not None), None)
+        return refined_mounting(self.estimates.values())
 
-    @property
-    def imu_used(self) -> bool:
-        """Whether a back end used the IMU: one may refuse it although it could be calibrated."""
-        return any(each.series is not None and each.series.knows_imu for each in self.estimates.values())
+    @cached_property
+    def content(self) -> report.ReportContent:
+        """What the report shows."""
+        return report.content_of(self)
 
     @property
     def duration_s(self) -> float:
@@ -175,7 +177,7 @@ def write_plots(folder: Path, outcome: Outcome) -> None:
 def write_report(folder: Path, outcome: Outcome) -> None:
     """Write report.html, the page that shows all of it."""
     with _replacing(folder / "report.html") as temporary:
-        report.write_report(temporary, report.content_of(outcome))
+        report.write_report(temporary, outcome.content)
 
 
 def write_metrics(folder: Path, outcome: Outcome, seconds: Mapping[str, float]) -> None:
@@ -202,26 +204,22 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
         },
         "trajectories": {name: _values(outcome, name) for name in outcome.metrics},
         "at_end": {name: _at_end(each) for name, each in outcome.trajectories.items()},
-        "calibration": _calibration(calibration, outcome.mounting),
+        "calibration": _calibration(calibration, placement(calibration, outcome.mounting)),
         "gnss": None if outcome.georeference is None else _georeference(outcome.georeference),
         "timing": {**seconds, "total": total, "realtime_factor": outcome.duration_s / total},
     }
 
 
-def _calibration(found: ImuCalibration, refined: Mounting | None) -> dict[str, Any]:
+def _calibration(found: ImuCalibration, known: Placement) -> dict[str, Any]:
     """How the IMU is mounted and what its clock reads; standard deviations are None where something was given."""
-    rotation = found.rotation_imu_camera if refined is None else refined.rotation_imu_camera
-    given = not np.any(found.rotation_std_rad)
-    std_rad = refined.rotation_std_rad if refined is not None else None if given else found.rotation_std_rad
-    offset_std_s = refined.ahead_std_s if refined is not None else found.time_offset_std_s or None
-    ahead_s = 0.0 if refined is None else refined.ahead_s
+    rotation, std_rad = known.rotation_imu_camera, known.rotation_std_rad
     return {
         "rotation_imu_camera_quat_wxyz": None if rotation is None else rotation.as_quat(scalar_first=True).tolist(),
         "rotation_std_deg": None if std_rad is None else np.rad2deg(std_rad).tolist(),
-        "time_offset_s": None if found.time_offset_s is None else found.time_offset_s + ahead_s,
-        "time_offset_std_s": offset_std_s,
-        "lever_arm_m": None if refined is None else refined.lever_arm_m.tolist(),
-        "lever_arm_std_m": None if refined is None else refined.lever_arm_std_m.tolist(),
+        "time_offset_s": known.time_offset_s,
+        "time_offset_std_s": known.time_offset_std_s,
+        "lever_arm_m": None if known.lever_arm_m is None else known.lever_arm_m.tolist(),
+        "lever_arm_std_m": None if known.lever_arm_std_m is None else known.lever_arm_std_m.tolist(),
         "gyro_bias_rad_s": found.gyro_bias.tolist(),
         "used": found.used,
         "reason": found.reason,

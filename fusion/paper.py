@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from fusion.compare import label_list, length_list
-from fusion_io.command import answered, write_text
+from fusion_io.command import answered, command_parser, write_text
 from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError
 
 if TYPE_CHECKING:
@@ -208,12 +208,11 @@ exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion.paper",
-        description="The tables and figures of the VIOLearner paper from runs with ground truth: t_rel and r_rel by "
+    parser = command_parser(
+        "fusion.paper",
+        "The tables and figures of the VIOLearner paper from runs with ground truth: t_rel and r_rel by "
         "sequence, quartiles by segment length, trajectories from above.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EPILOG,
     )
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN.mcap", help="logs of runs, or the runs' folders")
     parser.add_argument("--names", type=label_list, default=[], metavar="A,B,...", help="what the tables call the runs")

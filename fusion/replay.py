@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from fusion_io.command import STANDARD_OUTPUT, answered, write_json, write_text
+from fusion_io.command import STANDARD_OUTPUT, answered, command_parser, write_json, write_text
 from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay all combinations of settings, compare them with what was recorded, and show it; returns the exit code."""
     from fusion import compare, comparison
     from fusion.results import Result, log_file
+    from fusion.table import HEADINGS
     from fusion_io.progress import track
     from fusion_io.reader import open_log
 
@@ -95,6 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         write_folder(arguments.out, replays[order[0]], best)
     stream = sys.stderr if arguments.json == STANDARD_OUTPUT else sys.stdout
+    for name in not_run(configured(base, {}), configurations):
+        print(f"{HEADINGS[name]} not run again: no setting of it is given (--set backend=both runs both)", file=stream)
     if len(replays) > 1:
         _print(sweep_table(replays, compared, order, measure), stream)
     print(f"{replays[order[0]].label}, compared with the recorded run:", file=stream)
@@ -162,6 +165,14 @@ def configured(base: Mapping[str, Any], settings: Settings) -> RunConfig:
     return config.load(None, table)
 
 
+def not_run(base: RunConfig, configurations: Sequence[RunConfig]) -> list[str]:
+    """The back ends that the recorded run had and no replay has, because the settings do not concern them."""
+    from fusion.fusing import back_ends
+
+    run_again = {name for config in configurations for name in back_ends(config)}
+    return [name for name in back_ends(base) if name not in run_again]
+
+
 # --- Fusing -------------------------------------------------------------------------------------
 
 
@@ -180,6 +191,7 @@ def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list
     Raises LogError for a log without recorded pairs.
     """
     from fusion import chain, fusing, gnss, imu
+    from fusion.placement import imu_line
     from fusion.run import known_mounting
     from fusion_io.findings import Findings
 
@@ -194,8 +206,7 @@ def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list
     known = replace(known, skips=skips, loops=log.loops(), gnss=positions)
     estimates = fusing.fuse(known, config, findings)
     trajectories = {"raw": chain.chain(known.steps)} | {name: each.trajectory for name, each in estimates.items()}
-    used = "used" if calibration.used else "left out"
-    return trajectories, [f"IMU {used}: {calibration.reason}", *findings.notes]
+    return trajectories, [imu_line(calibration, estimates.values()), *findings.notes]
 
 
 def recorded_result(log: Log) -> Result | None:
@@ -224,16 +235,18 @@ def ranked(
     sort_by: a measure such as ``ekf.ate_m``. By default t_rel, or the ATE where the path is too short for it, of the
     back end whose settings vary, the pose graph where that leaves it open.
     """
-    from fusion.comparison import badness
-
     measures = [_measures(each) for each in compared]
     chosen = sort_by or _default_measure(measures, combinations)
-    order = list(range(len(compared)))
-    if chosen is None:
-        return order, None
-    values = [each.get(chosen) for each in measures]
-    distances = [math.inf if value is None else badness(chosen, value) for value in values]
-    return sorted(order, key=distances.__getitem__), chosen
+    distances = [math.inf if distance is None else distance for distance in _distances(compared, chosen)]
+    return sorted(range(len(compared)), key=distances.__getitem__), chosen
+
+
+def _distances(compared: Sequence[Comparison], measure: str | None) -> list[float | None]:
+    """How far each replay is from what would be right in a measure; None where that is not known."""
+    from fusion.comparison import badness
+
+    values = [None if measure is None else _measures(each).get(measure) for each in compared]
+    return [None if measure is None or value is None else badness(measure, value) for value in values]
 
 
 def check_measure(name: str | None, compared: Comparison) -> None:
@@ -262,15 +275,22 @@ def _default_measure(measures: Sequence[Mapping[str, float | None]], combination
 def sweep_table(
     replays: Sequence[Replay], compared: Sequence[Comparison], order: Sequence[int], measure: str | None
 ) -> Table:
-    """A row for every combination, the best first and marked; its columns are the settings that vary."""
+    """A row for every combination, the best first and marked, several that are equally good as equal.
+
+    Its columns are the settings that vary.
+    """
     from rich import box
     from rich.table import Table
 
-    from fusion.table import HEADINGS
+    from fusion.table import HEADINGS, best_of
 
+    distances = _distances(compared, measure)
+    best = best_of(distances)
     varied = [name for name in replays[0].settings if len({repr(each.settings[name]) for each in replays}) > 1]
     names = [name for name in replays[order[0]].trajectories if name != "raw"]
     by = f", sorted by {measure}" if measure else ": no ground truth, so none is the best"
+    if measure and not any(best):
+        by += ", in which all are equal"
     table = Table(title=f"{len(replays)} combinations{by}", title_justify="left", title_style="", box=box.SIMPLE_HEAD)
     table.add_column("")
     for name in varied:
@@ -286,9 +306,9 @@ def sweep_table(
             for name in names
             for key, _, _, decimals in _SHOWN
         ]
-        best = measure is not None and i == order[0]
         chosen = [str(replays[i].settings[name]) for name in varied]
-        table.add_row("best" if best else "", *chosen, *cells, style="bold" if best else "")
+        mark = "" if not best[i] else "best" if sum(best) == 1 else "equal"
+        table.add_row(mark, *chosen, *cells, style="bold" if best[i] else "")
     return table
 
 
@@ -363,12 +383,11 @@ exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion.replay",
-        description="Run the back ends again on what a log recorded (pairs, loops, IMU, GNSS), with other settings, "
+    parser = command_parser(
+        "fusion.replay",
+        "Run the back ends again on what a log recorded (pairs, loops, IMU, GNSS), with other settings, "
         "and compare with the trajectories that it recorded.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EPILOG,
     )
     parser.add_argument("run", type=Path, metavar="RUN.mcap", help="the log of a run, or the run's folder")
     parser.add_argument(

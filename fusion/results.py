@@ -17,6 +17,7 @@ from fusion_io.errors import LogError, UsageError
 from fusion_io.odometry import RecordedTrajectories, only_trajectory, read_trajectories
 from fusion_io.records import NANOSECONDS, IntArray, Trajectory
 from fusion_io.trajectory_files import file_format, read_indexed_kitti_poses, read_kitti, read_times, read_trajectory
+from fusion_io.words import counted
 
 ONLY_TRAJECTORY = "trajectory"
 """The name of the trajectory of a text file."""
@@ -58,7 +59,7 @@ def read_results(
     Raises LogError for a file that cannot be used, and UsageError for names or times that do not fit.
     """
     if names and len(names) != len(paths):
-        raise UsageError(f"--names: {len(names)} names for {len(paths)} inputs")
+        raise UsageError(f"--names: {counted(len(names), 'name')} for {counted(len(paths), 'input')}")
     if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise UsageError(f"--names: {repeated[0]!r} is there twice")
     files = [log_file(path) for path in paths]

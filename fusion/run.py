@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from fusion.export import Exports, add_options, checked, export
 from fusion_io import progress
-from fusion_io.command import STANDARD_OUTPUT, answered, role_and_topic, write_text
+from fusion_io.command import STANDARD_OUTPUT, answered, command_parser, role_and_topic, write_text
 from fusion_io.errors import EXIT_DAMAGED, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, LogError
+from fusion_io.words import counted
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -169,13 +170,13 @@ def pair_estimates(
         if not pairs:
             raise
         if progress.is_watched():
-            print(f"interrupted: going on with {len(pairs)} pairs; Ctrl-C again to give up", file=sys.stderr)
+            print(f"interrupted: going on with {counted(len(pairs), 'pair')}; Ctrl-C again to give up", file=sys.stderr)
         until_s = (pairs[-1].target_stamp_ns - log.start_ns) / 1e9
         findings.put(INTERRUPTED, 1, f"interrupted: results are of the first {until_s:.1f} s only")
     for name, count in skipped.items():
         findings.put(name, count, f"{name.replace('_', ' ')}: {count}")
     if not pairs:
-        reasons = "; ".join(findings.notes) or f"it has {len(log.frame_stamps())} frames"
+        reasons = "; ".join(findings.notes) or f"it has {counted(len(log.frame_stamps()), 'frame')}"
         raise LogError(f"{log.path}: no pair of frames could be estimated ({reasons})")
     return pairs, levels[: len(pairs)]  # one may have been under way when it was interrupted
 
@@ -271,17 +272,20 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
     """Print the table, what became of the IMU and where the results are."""
     from rich.console import Console
 
+    from fusion.placement import imu_line
+    from fusion.report.verdict import doubts
     from fusion.table import HEADINGS, print_table
 
-    log, calibration = outcome.log, outcome.calibration
-    title = f"{log.path.name}: {len(outcome.trajectories['raw'])} frames, {outcome.duration_s:.1f} s"
+    log = outcome.log
+    title = f"{log.path.name}: {counted(len(outcome.trajectories['raw']), 'frame')}, {outcome.duration_s:.1f} s"
     metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
     print_table(Console(file=stream), title, outcome.trajectories, metrics)
+    for doubt in doubts(outcome.content):
+        print(f"{doubt[0].upper()}{doubt[1:]}.", file=stream)
     print(f"At the end, right, down and ahead of the start: {'; '.join(ends(outcome.trajectories))}", file=stream)
     for remark in (*log.remarks, *outcome.findings.remarks):
         print(remark, file=stream)
-    refused = "calibrated, but no back end used it" if calibration.used else "left out"
-    print(f"IMU {'used' if outcome.imu_used else refused}: {calibration.reason}", file=stream)
+    print(imu_line(outcome.calibration, outcome.estimates.values()), file=stream)
     for name, estimate in outcome.estimates.items():
         print(f"{HEADINGS[name]}: {estimate.note}", file=stream)
     print(f"Results: {folder}", file=stream)
@@ -342,11 +346,10 @@ exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion.run",
-        description="Compute absolute camera trajectories, raw and fused, from an RGB-D and IMU log.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "fusion.run",
+        "Compute absolute camera trajectories, raw and fused, from an RGB-D and IMU log.",
+        _EPILOG,
     )
     parser.add_argument("--log", type=Path, required=True, metavar="FILE.mcap", help="the log to compute from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where results go (default: runs/<log name>-<time>)")

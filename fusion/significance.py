@@ -16,10 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import t as student_t
 
-from fusion.evaluation import SegmentErrors
+from fusion.evaluation import CONFIDENCE, SegmentErrors
 from fusion_io.records import FloatArray
 
-CONFIDENCE = 0.95
 SEEN = 2 / 3
 """The share of the variance of a mean that blocks as long as a segment see, where segments overlap evenly.
 
@@ -29,7 +28,6 @@ by 1 - x once more, which makes it 1/3.
 
 MIN_BLOCKS = 2.0
 """A series shorter than so many blocks has no interval."""
-
 
 ROUNDING = 1e-6
 """Differences below it, in percent or degrees per 100 m, are those of rounding."""

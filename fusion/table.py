@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from fusion.evaluation import anees_bounds
 from fusion_io.records import Trajectory
 
 Metrics = Mapping[str, float | int | None]
@@ -24,6 +25,9 @@ HEADINGS = {
 }
 
 WIDTH_OF_NUMBER = 9
+EQUAL = 1e-9  # relative: what differs less is the same result in other digits
+
+ANEES_RULE = "an ANEES above {1:.1f} is overconfident, below {0:.1f} timid".format(*anees_bounds())
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,10 @@ class _Row:
     decimals: int
     scale: float = 1.0
     right: float = 0.0
+
+    def best(self, values: Sequence[float | int | None]) -> list[bool]:
+        """Which of the values are nearest to what would be right, as `best_of`."""
+        return best_of([None if value is None else abs(value - self.right) for value in values])
 
 
 ROWS = (
@@ -73,13 +81,18 @@ def print_table(
 
 def _cells(row: _Row, values: Sequence[float | int | None]) -> list[Text]:
     """The values of a row, the best one in bold (seen on a terminal only)."""
-    best = min(abs(value - row.right) for value in values if value is not None)
     return [
-        Text("-")
-        if value is None
-        else Text(number(value * row.scale, row.decimals), style="bold" if abs(value - row.right) == best else "")
-        for value in values
+        Text("-") if value is None else Text(number(value * row.scale, row.decimals), style="bold" if best else "")
+        for value, best in zip(values, row.best(values), strict=True)
     ]
+
+
+def best_of(distances: Sequence[float | None]) -> list[bool]:
+    """Which of the distances from what is right are the least; none where all are equal, or there is but one."""
+    known = [each for each in distances if each is not None]
+    if len(known) < 2 or max(known) - min(known) <= EQUAL * max(known):
+        return [False] * len(distances)
+    return [each is not None and each - min(known) <= EQUAL * max(known) for each in distances]
 
 
 def number(value: float, decimals: int) -> str:
@@ -93,7 +106,7 @@ def _legend(metrics: Mapping[str, Metrics]) -> str:
         return "No ground truth for these frames in the log, so no errors can be given."
     if all(values["t_rel_percent"] is None for values in metrics.values()):
         return "Lower is better. No t_rel: the path is shorter than the shortest of --segment-lengths."
-    return "Lower is better; an ANEES above 3 is overconfident."
+    return f"Lower is better; {ANEES_RULE}."
 
 
 def final_sigma(trajectory: Trajectory) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import shlex
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from fusion.events import DROPPED_FRAMES, IMU_GAP, MISSING_PAIRS, STAND_STILL, W
 from fusion.imu import ImuCalibration
 from fusion.log_statistics import DepthStatistics, ImageStatistics, ImuStatistics, TopicStatistics
 from fusion_io.records import NANOSECONDS
+from fusion_io.words import counted
 
 GRAVITY = 9.81
 GRAVITY_TOLERANCE = 0.5  # m/s^2: more is a bias, a wrong scale, or another unit
@@ -66,7 +68,8 @@ class Reason:
 class Found:
     """What a log holds and what is known of it; roles as in ``fusion_io.roles``, statistics by topic.
 
-    calibration: of the IMU by the recorded pair estimates, None without them.
+    calibration: of the IMU by the recorded pair estimates, None without them. trajectories: topics of somebody's
+    odometry or poses. choices: topics that could be chosen for a role that none is found for, by role.
     refusal: why the log cannot be opened to run, "" where it can. faults, remarks: lines of the reader on what is wrong
     with the log, and on what is worth knowing.
     """
@@ -82,6 +85,13 @@ class Found:
     imus: Mapping[str, ImuStatistics]
     events: Sequence[Event] = ()
     calibration: ImuCalibration | None = None
+    trajectories: Sequence[str] = ()
+    choices: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def held(self) -> Collection[str]:
+        """The roles that the log can fill; where it could not be opened, those that some topic of it fits."""
+        return self.roles.keys() or {each.kind for each in self.topics.values()} - {""}
 
 
 def reasons(found: Found) -> list[Reason]:
@@ -113,24 +123,44 @@ def _reported(found: Found, line: str, level: Level) -> Reason:
 
 
 def _contents(found: Found) -> Iterable[Reason]:
-    """Whether there is something to run on at all."""
+    """Whether there is something to run on at all: everything that stands in the way, not only the first of it."""
     if found.refusal:
         yield _reported(found, found.refusal, Level.BLOCKS)
-        return
-    roles = found.roles
-    if "pairs" not in roles:
-        missing = [words for role, words in _NEEDED.items() if role not in roles]
-        if missing:
-            yield Reason(Level.BLOCKS, f"no pair estimates, and to make some it lacks {', '.join(missing)}")
-        elif (frames := found.topics[roles["image"]]).messages < FEWEST_FRAMES:
-            yield Reason(Level.BLOCKS, f"{frames.messages} image: a pair needs two", frames.topic, frames.start_ns)
-    if "imu" not in roles and not {"gyro", "accelerometer"} <= roles.keys():
-        yield Reason(Level.LIMIT, "no IMU: there is little that fusion can add to the pair estimates")
+    roles, held = found.roles, found.held
+    if "pairs" not in held:
+        missing = [role for role in _NEEDED if role not in held]
+        if missing and held:
+            words = ", ".join(_NEEDED[role] for role in missing)
+            text = f"no pair estimates, and to make some it lacks {words}"
+            yield Reason(Level.BLOCKS, text + _how_to_choose(found, missing))
+        elif "image" in roles and (frames := found.topics[roles["image"]]).messages < FEWEST_FRAMES:
+            images = counted(frames.messages, "image")
+            yield Reason(Level.BLOCKS, f"{images}: a pair needs two", frames.topic, frames.start_ns)
+        if missing and found.trajectories:
+            yield Reason(Level.BLOCKS, _of_a_trajectory(found))
+    if held and "imu" not in held and not {"gyro", "accelerometer"} <= set(held):
+        text = "no IMU: there is little that fusion can add to the pair estimates"
+        yield Reason(Level.LIMIT, text + _how_to_choose(found, ["imu"]))
     if found.calibration is not None and not found.calibration.used:
         topic = roles.get("imu") or roles.get("gyro", "")
         yield Reason(Level.LIMIT, f"the IMU would be left out: {found.calibration.reason}", topic)
-    if "ground_truth" not in roles:
-        yield Reason(Level.NOTE, "no ground truth: errors cannot be computed")
+    if held and "ground_truth" not in held:
+        text = "no ground truth: errors cannot be computed"
+        yield Reason(Level.NOTE, text + _how_to_choose(found, ["ground_truth"]))
+
+
+def _how_to_choose(found: Found, missing: Sequence[str]) -> str:
+    """The options that give these roles a topic, where some topic could play them."""
+    options = [f"--topic {role}={topic}" for role in missing for topic in found.choices.get(role, ())]
+    return f"; if a topic holds it under another name, say so: {' or '.join(options)}" if options else ""
+
+
+def _of_a_trajectory(found: Found) -> str:
+    """That a trajectory has to become pair estimates first, and how."""
+    log = shlex.quote(str(found.path))
+    imu = f" --imu {log}" if "imu" in found.held else ""
+    command = f"violearner convert trajectory --poses {log} --topic {found.trajectories[0]}{imu} --out pairs.mcap"
+    return f"it holds a trajectory instead ({', '.join(found.trajectories)}): make pair estimates of it with {command}"
 
 
 _NEEDED = {"image": "images", "depth": "depth", "camera_info": "camera info"}
@@ -215,7 +245,8 @@ def _times(found: Found) -> Iterable[Reason]:
             text = f"the time from stamp to recording, {times.clock_offset_s:.2f} s, varies by {spread:.2f} s"
             yield Reason(Level.NOTE, text, topic, times.start_ns)
         if times.backward and times.clock == "stamp" and topic not in found.roles.values():
-            yield Reason(Level.NOTE, f"{times.backward} stamps go back in time", topic, times.start_ns)
+            text = f"{counted(times.backward, 'stamp goes', 'stamps go')} back in time"
+            yield Reason(Level.NOTE, text, topic, times.start_ns)
 
 
 def _events(found: Found) -> Iterable[Reason]:

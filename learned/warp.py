@@ -64,7 +64,8 @@ def sample(image: Tensor, grid: Tensor) -> Tensor:
     """
     height, width = image.shape[-2:]
     # Of a network that has diverged: no place in the image.
-    normalised = grid.nan_to_num() * grid.new_tensor([2 / (width - 1), 2 / (height - 1)]) - 1
+    span = grid.new_tensor([max(width - 1, 1), max(height - 1, 1)])
+    normalised = 2 * grid.nan_to_num() / span - 1
     return functional.grid_sample(image, normalised, align_corners=True, padding_mode="border")
 
 

@@ -1,12 +1,24 @@
 """The statistics of a log are what was put in, and every fault is a reason with its topic and time."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from log_samples import SECOND, START, depth, grey, imu_message, pair_estimates, write_raw, write_sample
+from log_samples import (
+    SECOND,
+    START,
+    camera_info,
+    depth,
+    grey,
+    imu_message,
+    pair_estimates,
+    raw_image,
+    write_raw,
+    write_sample,
+)
 from mcap.writer import Writer
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -15,14 +27,23 @@ from fusion.allan import ALLAN, FASTEST_CHANGES
 from fusion.analysis import analyse, document
 from fusion.analysis_page import page
 from fusion.log_statistics import of_depths, of_images, of_topic, revisits
-from fusion_io import messages
+from fusion_io import convert, messages
 from fusion_io.container import Channel
-from fusion_io.messages import ImuSample
+from fusion_io.messages import ImuSample, PoseSample
+from fusion_io.reader import open_log
 from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, ImuSeries, IntArray, Trajectory
 from fusion_io.survey import Times
 from fusion_io.writer import LogWriter
 
 MS = 1_000_000
+
+
+def odometry(topic: str, stamp: int, ahead_m: float) -> tuple[str, str, int, bytes]:
+    """nav_msgs/Odometry of a robot that drives straight ahead."""
+    pose = PoseSample(np.array([ahead_m, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+    return topic, messages.ODOMETRY, stamp, messages.encode_odometry(stamp, pose, "base")
+
+
 CHANNEL = Channel("/x", "sensor_msgs/msg/Imu", "cdr")
 
 
@@ -233,6 +254,64 @@ def test_sensors_are_looked_at_although_the_log_leaves_open_which_to_use(tmp_pat
     assert set(analysed["imu"]) == {"/a", "/b"}
     chosen = document(analyse(path, {"imu": "/b"}))
     assert chosen["log"]["roles"] == {"imu": "/b"}
+
+
+# --- What stands in the way -------------------------------------------------------------------
+
+
+def blockers(analysed: dict[str, Any]) -> list[str]:
+    return [reason["text"] for reason in analysed["verdict"]["reasons"] if reason["level"] == "blocks"]
+
+
+def test_everything_that_stands_in_the_way_is_named_and_not_only_the_first_of_it(tmp_path: Path) -> None:
+    """Two choices that are left open, and depth that is missing, at once."""
+    items = [raw_image(topic, START + i, grey(i), "mono8") for i in range(3) for topic in ("/left", "/right")]
+    items += [imu_message(topic, START, ImuSample(np.ones(3), np.ones(3))) for topic in ("/a", "/b")]
+    items += [camera_info(f"/{side}/camera_info", START) for side in ("left", "right")]
+    named = blockers(found(write_raw(tmp_path / "a.mcap", items)))
+    assert named == [
+        "2 topics could be the imu: /a, /b; choose one, such as --topic imu=/a; "
+        "2 topics could be the image: /left, /right; choose one, such as --topic image=/left",
+        "no pair estimates, and to make some it lacks depth",
+    ]
+
+
+def test_a_topic_that_could_play_a_missing_role_is_named_with_the_option(tmp_path: Path) -> None:
+    """As depth that somebody painted for the eye, or odometry where there is no ground truth."""
+    items = [raw_image("/image", START, grey(), "mono8"), camera_info("/camera_info", START)]
+    items += [raw_image("/depth_view", START, grey(), "mono8")]
+    items += [odometry("/odom", START, 0.0)]
+    verdict = found(write_raw(tmp_path / "a.mcap", items))["verdict"]
+    texts = {reason["text"] for reason in verdict["reasons"]}
+    assert (
+        "no pair estimates, and to make some it lacks depth; if a topic holds it under another name, say so: "
+        "--topic depth=/depth_view"
+    ) in texts
+    assert (
+        "no ground truth: errors cannot be computed; if a topic holds it under another name, say so: "
+        "--topic ground_truth=/odom"
+    ) in texts
+
+
+@pytest.mark.parametrize("with_imu", [False, True])
+def test_for_a_trajectory_alone_the_command_is_named_that_makes_pair_estimates_of_it(
+    tmp_path: Path, with_imu: bool
+) -> None:
+    """A command that works as it is: what it makes can be run."""
+    path = tmp_path / "a b.mcap"
+    items = [odometry("/odom", START + i * SECOND // 10, 0.1 * i) for i in range(20)]
+    items += [imu_message("/imu", START + i * MS, ImuSample(np.ones(3), np.ones(3))) for i in range(20 * with_imu)]
+    named = blockers(found(write_raw(path, items)))[-1]
+    imu = f" --imu '{path}'" if with_imu else ""
+    command = f"violearner convert trajectory --poses '{path}' --topic /odom{imu} --out pairs.mcap"
+    assert named == f"it holds a trajectory instead (/odom): make pair estimates of it with {command}"
+    words = shlex.split(command)[2:]
+    words[-1] = str(tmp_path / "pairs.mcap")
+    assert convert.main(words) == 0
+    made = open_log(tmp_path / "pairs.mcap")
+    assert len(made.pairs()) == 19
+    assert len(made.imu()) == 20 * with_imu
+    assert found(tmp_path / "pairs.mcap")["verdict"]["answer"] == "usable with limits"
 
 
 # --- The whole ----------------------------------------------------------------------------------

@@ -71,6 +71,17 @@ def test_an_interrupted_command_ends_with_130(
     assert capsys.readouterr().err == "interrupted\n"
 
 
+@pytest.mark.parametrize(
+    "name", [name for name, (module, _) in cli.COMMANDS.items() if not module.startswith("learned")]
+)
+def test_help_and_usage_errors_show_the_command_as_it_was_called(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["--help"], ["--no-such-option"]):
+        with pytest.raises(SystemExit):
+            cli.main([name, *words])
+        captured = capsys.readouterr()
+        assert (captured.out + captured.err).startswith(f"usage: violearner {name} ")
+
+
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
 def test_every_option_says_what_it_does(name: str) -> None:
     for action in cli.parser_of(name)._actions:
@@ -137,16 +148,30 @@ def test_progress_shows_count_rate_and_time_left_on_a_terminal(monkeypatch: pyte
         assert words in shown
 
 
-def test_nobody_watching_or_silence_asked_for_means_no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence_asked_for_means_no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     items = [1, 2]
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
-    assert progress.track(items, "count") is items
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setattr(progress, "_silent", False)
     progress.silence()
     assert progress.track(items, "count") is items
     progress.silence(False)
     assert progress.track(items, "count") is not items
+
+
+def test_without_a_terminal_a_long_loop_says_now_and_then_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line each period, without colours or line feeds that go back; a short loop says nothing."""
+    seconds = iter(range(0, 10_000, 10))  # an item takes ten of them
+    monkeypatch.setattr(progress, "monotonic", lambda: next(seconds))
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    assert list(progress.track([1, 2], "short")) == [1, 2]
+    assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]
+    assert list(progress.track(range(8), "replay")) == list(range(8))
+    assert list(progress.track(iter("abcde"), "count")) == list("abcde")
+    assert sys.stderr.getvalue().splitlines() == [  # type: ignore[attr-defined]
+        "replay: 2 of 8, 0.067/s, 90 s left",
+        "replay: 5 of 8, 0.083/s, 36 s left",
+        "count: 2, 0.067/s",
+    ]
 
 
 def test_the_options_of_a_run_are_listed_with_examples(capsys: pytest.CaptureFixture[str]) -> None:

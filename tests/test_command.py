@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fusion_io.command import STANDARD_OUTPUT, answered, role_and_topic, write_json
+from fusion_io.command import STANDARD_OUTPUT, answered, called_as, command_parser, role_and_topic, write_json
 from fusion_io.errors import LogError, UsageError
 
 
@@ -54,3 +54,17 @@ def test_a_role_needs_a_topic(text: str) -> None:
     assert role_and_topic("imu=/a=b") == ("imu", "/a=b")
     with pytest.raises(argparse.ArgumentTypeError, match="ROLE=NAME"):
         role_and_topic(text)
+
+
+def test_a_command_is_called_in_its_help_as_it_was_called() -> None:
+    """By its module, or by the name that stands for it meanwhile; the rest of an example stays."""
+
+    def shown() -> str:
+        return command_parser("fusion.run", "What it does.", "examples:\n  python -m fusion.run --log a").format_help()
+
+    assert shown().startswith("usage: python -m fusion.run ")
+    with called_as("violearner run"):
+        named = shown()
+    assert named.startswith("usage: violearner run ")
+    assert "examples:\n  violearner run --log a" in named
+    assert shown().startswith("usage: python -m fusion.run ")

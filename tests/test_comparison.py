@@ -110,6 +110,25 @@ def test_inputs_of_other_times_are_not_compared_and_that_is_said() -> None:
     assert compared.notes == ["a.raw and b.raw are not compared: they and the ground truth have no times in common"]
 
 
+def test_inputs_that_cover_different_times_are_said_to() -> None:
+    """Who covers what, counted from the first of all; inputs that begin and end together need no remark."""
+    whole = walk(1)
+    part = Trajectory(whole.stamps_ns[100:300], whole.poses[100:300])
+    assert comparison.compare([_result("a", whole), _result("b", walk(2))], None, LENGTHS).notes == []
+    (note,) = comparison.compare([_result("a", whole), _result("b", part)], None, LENGTHS).notes
+    first, last = ((stamp - whole.stamps_ns[0]) / 1e9 for stamp in part.stamps_ns[[0, -1]])
+    end = (whole.stamps_ns[-1] - whole.stamps_ns[0]) / 1e9
+    covered = f"a (run a) 0.0 to {end:.1f} s, b (run b) {first:.1f} to {last:.1f} s"
+    assert note.startswith(f"the inputs cover different times: {covered}; ")
+
+
+def test_equals_are_none_of_them_the_best() -> None:
+    same = comparison.compare([_result("a", walk(1)), _result("b", walk(1))], None, LENGTHS)
+    assert same.best("ate_m") == set()
+    other = comparison.compare([_result("a", walk(1)), _result("b", walk(2, drift=5e-4))], None, LENGTHS)
+    assert other.best("ate_m") == {"a.raw"}
+
+
 def test_who_meets_whom() -> None:
     poses = walk(1)
     run = Result("a", "run", Path("a"), dict.fromkeys(("raw", "posegraph", "ekf"), poses), TRUTH)
@@ -214,7 +233,7 @@ def test_names_are_one_an_input_and_different(tmp_path: Path) -> None:
     labels = [each.label for each in read_results([tum, tum, tmp_path / "x" / "other.tum", tmp_path / "run.mcap"])[0]]
     folder = tmp_path.name
     assert labels == [f"{folder}/other (a)", f"{folder}/other (b)", "x/other", folder]
-    for names, reason in ((["x"], "1 names for 2 inputs"), (["x", "x"], "'x' is there twice")):
+    for names, reason in ((["x"], "1 name for 2 inputs"), (["x", "x"], "'x' is there twice")):
         with pytest.raises(UsageError, match=reason):
             read_results([tum, kitti], names)
 

@@ -69,6 +69,20 @@ def test_the_filter_uses_no_imu_that_the_pose_graph_had_to_leave_out() -> None:
     assert estimates["ekf"].note == "pairs only: no IMU"
 
 
+def test_who_asked_for_the_filter_alone_is_told_nothing_of_the_pose_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither that it rejects pairs nor that it fails: it only helps the filter to a mounting."""
+    graph = posegraph.solve(KNOWN, POSE_GRAPH)
+    for helped in (lambda *_: replace(graph, rejected=3), lambda *_: fail()):
+        monkeypatch.setattr(posegraph, "solve", helped)
+        findings = Findings()
+        assert list(fusing.fuse(KNOWN, _config("ekf"), findings)) == ["ekf"]
+        assert findings.notes == []
+
+
+def fail() -> None:
+    raise RuntimeError("Indeterminant linear system")
+
+
 @pytest.mark.parametrize("broken", ["posegraph", "ekf"])
 @pytest.mark.parametrize(
     "error", [RuntimeError("Indeterminant\nlinear system"), np.linalg.LinAlgError("singular"), LogError("no pair")]

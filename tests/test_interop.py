@@ -377,6 +377,19 @@ def test_a_missing_extra_is_named_before_anything_is_computed(monkeypatch: pytes
         export.checked(export.Exports(rerun=tmp_path / "a.rrd"))
 
 
+def test_the_folder_of_a_run_stands_for_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    _, _, imu = drive()
+    with LogWriter(tmp_path / "out" / "run.mcap") as log:
+        log.imu(imu)
+    for given, to in ((tmp_path / "out", "folder"), (tmp_path / "out" / "run.mcap", "file")):
+        assert export.main([str(given), "--csv", str(tmp_path / to)]) == 0
+    assert (tmp_path / "folder" / "imu.csv").read_bytes() == (tmp_path / "file" / "imu.csv").read_bytes()
+    (tmp_path / "empty").mkdir()
+    assert export.main([str(tmp_path / "empty"), "--csv", str(tmp_path / "none")]) == 1
+    assert capsys.readouterr().err == f"error: {tmp_path / 'empty' / 'run.mcap'}: no such file\n"
+
+
 def test_an_export_to_nowhere_is_a_usage_error(full_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert export.main([str(full_log)]) == 2
     assert "give --csv, --parquet or --rerun" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from fusion_io import messages
 from fusion_io.errors import LogError
 from fusion_io.messages import PoseSample
-from fusion_io.odometry import name_of, only_trajectory, read_trajectories
+from fusion_io.odometry import name_of, only_trajectory, read_trajectories, trajectory_on
 from fusion_io.reader import open_log
 from fusion_io.records import Trajectory
 from fusion_io.writer import LogWriter
@@ -111,6 +111,19 @@ def test_bad_poses_are_left_out_and_counted(tmp_path: Path) -> None:
     assert found.poses.translation[:, 0].tolist() == [0.0, 3.0, 4.0, 5.0]
     (note,) = recorded.notes
     assert "/odom: 4 poses are left out" in note
+
+
+def test_the_trajectory_on_a_topic_is_taken_or_what_there_is_is_named(tmp_path: Path) -> None:
+    two = [_odometry(topic, START + k * SECOND, _pose(k)) for k in range(3) for topic in ("/odom", "/slam/pose")]
+    path = write_raw(tmp_path / "two.mcap", two)
+    recorded = read_trajectories(path)
+    assert len(trajectory_on(path, recorded, "/slam/pose")) == 3
+    for topic, reason in ((None, "which of its trajectories?"), ("/x", "no trajectory on /x.")):
+        with pytest.raises(LogError) as caught:
+            trajectory_on(path, recorded, topic)
+        assert str(caught.value) == f"{path}: {reason} It holds odom, slam_pose; choose one with --topic"
+    path = write_raw(tmp_path / "one.mcap", two[::2])
+    assert len(trajectory_on(path, read_trajectories(path), None)) == 3
 
 
 def test_a_log_without_poses_has_no_trajectories(tmp_path: Path) -> None:

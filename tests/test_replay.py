@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 from log_samples import imu_series, trajectory, write_sample
 
 from fusion import replay
+from fusion.comparison import Comparison
 from fusion.config import RunConfig
+from fusion.evaluation import Metrics
+from fusion.results import Result
 from fusion_io.errors import LogError, UsageError
 from fusion_io.reader import open_log
 from fusion_io.writer import LogWriter
@@ -155,3 +158,44 @@ def test_what_cannot_be_done_is_one_line_and_its_exit_code(
     log = write_sample(tmp_path / "log.mcap")
     assert replay.main([str(log), *options]) == code
     assert reason in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({"posegraph.gyro_noise": 1e-3}, ["ekf"]),
+        ({"ekf.gyro_noise": 1e-3}, ["posegraph"]),
+        ({"ekf.gyro_noise": 1e-3, "posegraph.gyro_noise": 1e-3}, []),
+        ({"ekf.gyro_noise": 1e-3, "backend": "both"}, []),
+        ({}, []),
+    ],
+)
+def test_a_back_end_that_the_settings_drop_is_told(settings: dict[str, object], names: list[str]) -> None:
+    assert replay.not_run(RunConfig(), [replay.configured({}, settings)]) == names
+
+
+@pytest.mark.parametrize(
+    ("t_rel", "marks", "all_equal"),
+    [
+        ([2.0, 1.0, 3.0], ["best", "", ""], False),
+        ([2.0, 1.0, 1.0 + 1e-12], ["equal", "equal", ""], False),
+        ([1.0, 1.0, 1.0], ["", "", ""], True),
+        ([None, 1.0, 2.0], ["best", "", ""], False),
+    ],
+)
+def test_only_what_is_better_than_others_is_marked_best(
+    t_rel: list[float | None], marks: list[str], all_equal: bool
+) -> None:
+    """Several that are equally good are called equal, and where all are, none is the best."""
+    combinations = [{"ekf.gyro_noise": value} for value in range(3)]
+    truth = trajectory()
+    result = Result("b", "replay", Path("b.mcap"), {"raw": truth, "ekf": truth})
+    compared = [
+        Comparison([result], (), {"b.raw": Metrics(), "b.ekf": Metrics(t_rel_percent=value, ate_m=value)}, [], [], [])
+        for value in t_rel
+    ]
+    replays = [replay.Replay(each, RunConfig(), result.trajectories, [], []) for each in combinations]
+    order, measure = replay.ranked(compared, None, combinations)
+    table = replay.sweep_table(replays, compared, order, measure)
+    assert list(table.columns[0].cells) == marks
+    assert ("in which all are equal" in str(table.title)) == all_equal

@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from report_samples import LENGTHS_M, content
 
 from fusion import events
-from fusion.evaluation import errors_over_time, evaluate
+from fusion.evaluation import anees_bounds, errors_over_time, evaluate
 from fusion.gnss import PlacedFixes
 from fusion.report import ReportContent, Thumbnail, write_report
 from fusion.report import content as content_module
@@ -252,8 +252,57 @@ def test_a_run_worse_than_raw_is_called_bad(full: ReportContent) -> None:
 def test_an_overconfident_run_is_no_good_run(full: ReportContent) -> None:
     metrics = {**full.metrics, "posegraph": replace(full.metrics["posegraph"], anees_position=50.0)}
     said = verdict(replace(full, metrics=metrics, series={}, warnings={}))
-    assert "stated uncertainty is too small (ANEES 50, 3 is right)" in said.text
+    assert "its position errors are 4.1 times its sigmas: overconfident (ANEES 50, 3 is right)" in said.text
     assert said.status == "caution"
+
+
+def test_verdict_table_and_figure_judge_an_anees_by_one_rule(full: ReportContent) -> None:
+    """What the legend calls overconfident is what the verdict calls so, for position and for orientation."""
+    _, high = anees_bounds()
+    for what in ("position", "orientation"):
+        for value, word in ((high - 0.01, "consistent"), (high + 0.01, "overconfident")):
+            metrics = replace(full.metrics["posegraph"], **{f"anees_{what}": value})
+            said = verdict(replace(full, metrics={**full.metrics, "posegraph": metrics}, series={}, warnings={}))
+            assert f"its {what} errors are 1.3 times its sigmas: {word} (ANEES {value:.3g}, 3 is right)" in said.text
+            assert (said.status == "caution") == (word == "overconfident")
+    rule = f"an ANEES above {high:.1f} is overconfident"
+    assert rule in _read(page(full)).text
+    assert f"above {high:.1f} is overconfident" in _by_key(full)["nees"].caption
+
+
+def test_the_verdict_says_where_the_camera_was_at_the_end(full: ReportContent) -> None:
+    right, down, ahead = full.trajectories["posegraph"].poses.translation[-1]
+    said = verdict(full).text
+    assert f"{abs(right):.1f} m {'right' if right > 0 else 'left'}" in said
+    assert f"{abs(down):.1f} m {'below' if down > 0 else 'above'}" in said
+    assert f"{abs(ahead):.1f} m {'ahead' if ahead > 0 else 'behind'} of where it began (stated sigma" in said
+
+
+def test_a_hole_in_everything_leads_the_verdict_with_the_time_from_which_the_pose_is_lost() -> None:
+    def cut(pairs: list[PairEstimate], imu: ImuSeries) -> tuple[list[PairEstimate], ImuSeries]:
+        kept = (np.arange(len(imu)) < 1000) | (np.arange(len(imu)) >= 2200)
+        return pairs, ImuSeries(imu.stamps_ns[kept], imu.angular_velocity[kept], imu.linear_acceleration[kept])
+
+    run = content(40.0, cut)
+    run = replace(run, pairs=[*run.pairs[:100], *run.pairs[220:]])
+    assert "a loop closure ties the poses after it" in verdict(run).text
+    run = replace(run, loops=())
+    said = verdict(run)
+    assert said.text.startswith(
+        "The absolute pose is lost after 10.0 s: nothing measured the motion from 10.0 to 22.0 s, and all poses after "
+        "it rest on 12.0 s of extrapolation"
+    )
+    assert said.status == "bad"
+    assert said.sentences[0] in _read(page(run)).text
+
+
+def test_a_damaged_log_is_named_in_the_verdict_with_when_the_result_ends(full: ReportContent) -> None:
+    said = verdict(replace(full, damage=["the file is cut or unfinished: its data ends at byte 6 of 9"]))
+    assert said.text.startswith("The log is damaged: the file is cut or unfinished: its data ends at byte 6 of 9; ")
+    assert "until 39.9 s." in said.text
+    assert said.status == "caution"
+    many = verdict(replace(full, damage=[f"chunk {i}" for i in range(5)])).text
+    assert "chunk 2; and 2 more faults; the result is" in many
 
 
 def test_without_ground_truth_the_verdict_is_about_consistency(full: ReportContent) -> None:
@@ -264,7 +313,7 @@ def test_without_ground_truth_the_verdict_is_about_consistency(full: ReportConte
     assert "o ground truth" in said.text
     assert f"NIS inside its 95 % bounds for {100.0 * inside:.0f} % of the pairs" in said.text
     assert "pose graph and EKF differ by" in said.text
-    assert "stated sigma at the end" in said.text
+    assert "of where it began (stated sigma" in said.text
 
 
 def test_a_good_run_without_faults_is_good(full: ReportContent) -> None:

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import RigidTransform
 
-from fusion.table import ROWS, print_table
+from fusion.table import ROWS, best_of, print_table
 from fusion_io.records import Trajectory
 
 NAMES = ("raw", "posegraph", "ekf")
@@ -57,3 +57,18 @@ def test_path_and_stated_uncertainty_need_no_ground_truth(name: str) -> None:
 
 def test_a_log_shorter_than_a_segment_says_so() -> None:
     assert "--segment-lengths" in _printed({"raw": _metrics(1.0) | {"t_rel_percent": None}})
+
+
+@pytest.mark.parametrize(
+    ("distances", "best"),
+    [
+        ([2.0, 1.0, None], [False, True, False]),
+        ([1.0, 1.0, 2.0], [True, True, False]),
+        ([1.0, 1.0 + 1e-12], [False, False]),
+        ([1.0, None], [False, False]),
+        ([0.0, 0.0], [False, False]),
+        ([None], [False]),
+    ],
+)
+def test_the_best_is_better_than_another(distances: list[float | None], best: list[bool]) -> None:
+    assert best_of(distances) == best

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from fusion import events, gnss
 from fusion.evaluation import KITTI_SEGMENT_LENGTHS_M, Metrics
 from fusion.events import Event
+from fusion.extrapolation import Extrapolation, extrapolations
 from fusion.gnss import PlacedFixes
-from fusion.imu import ImuCalibration
+from fusion.imu import ImuCalibration, on_camera_clock
 from fusion.measurements import Mounting
 from fusion_io.errors import LogError
 from fusion_io.findings import Findings
@@ -45,10 +46,10 @@ class ReportContent:
     """All that a report shows; what is empty is said to be missing rather than drawn.
 
     trajectories: by name, raw among them. segment_lengths_m: of t_rel and r_rel. series: what a back end estimated
-    beside the poses, by its name; mounting: of the IMU, as the pose graph refined it; loops_used: which of the loops it
+    beside the poses, by its name; mounting: of the IMU, as a back end refined it; loops_used: which of the loops it
     believed (M,). topics: the name of each role. warnings: counts by name, notes: a line for each. remarks: what the
     back ends say, by name. fixes: GNSS positions, where the pose graph found out where the world is. levels: pairs
-    whose hypotheses are the motions after each level of the network.
+    whose hypotheses are the motions after each level of the network. damage: a line for each fault of the file.
     """
 
     title: str
@@ -71,6 +72,7 @@ class ReportContent:
     thumbnails: Sequence[Thumbnail] = ()
     fixes: PlacedFixes | None = None
     levels: Sequence[PairEstimate] = ()
+    damage: Sequence[str] = ()
 
     @property
     def start_ns(self) -> int:
@@ -103,6 +105,20 @@ class ReportContent:
     def events(self) -> list[Event]:
         """What went wrong with the sensors, in order of time, on the camera's clock."""
         return events.in_order([*self._imu_events(), *self._camera_events()])
+
+    @cached_property
+    def extrapolations(self) -> list[Extrapolation]:
+        """Where the headline's trajectory rests on no measurement for long."""
+        name = self.headline
+        series = self.series.get(name)
+        imu = None
+        if self.imu is not None and self.calibration is not None and series is not None and series.knows_imu:
+            imu = on_camera_clock(self.imu, self.calibration)
+        used = self.loops_used.get(name, np.zeros(0, dtype=np.bool_))
+        loops = [loop for loop, believed in zip(self.loops, used, strict=False) if believed]
+        tied = self.fixes is not None and name == "posegraph"
+        fixes_ns = self.fixes.stamps_ns[self.fixes.used] if self.fixes and tied else np.zeros(0, dtype=np.int64)
+        return extrapolations(self.trajectories[name], self.pairs, imu, loops, fixes_ns)
 
     def _imu_events(self) -> Iterator[Event]:
         if self.imu is None or not len(self.imu):
@@ -168,6 +184,7 @@ def content_of(outcome: Outcome) -> ReportContent:
         thumbnails=thumbnails(log),
         fixes=_fixes(outcome),
         levels=outcome.levels,
+        damage=[line.removeprefix(f"{log.path}: ") for line in log.damage],
     )
 
 

@@ -13,9 +13,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
 from fusion import events
-from fusion.evaluation import MIN_VARIANCE, common, errors_over_time, pose_errors, segment_errors
+from fusion.evaluation import (
+    ANEES_DIMENSIONS,
+    CONFIDENCE,
+    MIN_VARIANCE,
+    anees_bounds,
+    common,
+    errors_over_time,
+    pose_errors,
+    segment_errors,
+)
 from fusion.report.content import ReportContent
-from fusion.report.verdict import COVERAGE, agreements, label, nis_bounds
+from fusion.report.verdict import agreements, label, nis_bounds
 from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
 
 TIME = "time since the first frame [s]"
@@ -267,12 +276,13 @@ def hypothesis_errors(content: ReportContent) -> Figure:
 
 def nees(content: ReportContent) -> Figure:
     """Normalised estimation error squared over time, with the bounds that it should stay in."""
-    low, high = (float(bound) for bound in chi2.interval(COVERAGE, 3))
+    low, high = (float(bound) for bound in chi2.interval(CONFIDENCE, ANEES_DIMENSIONS))
     found = Figure(
         "nees",
-        "NEES: is the stated uncertainty honest?",
-        f"Squared error by its covariance, 3 degrees of freedom. 95 % of independent errors are between {low:.2f} and "
-        f"{high:.2f}; above: overconfident. Errors of one run hang together, so a run may stay on one side.",
+        "NEES: is the stated uncertainty right?",
+        f"Squared error by its covariance, 3 degrees of freedom; 95 % of single errors are between {low:.2f} and "
+        f"{high:.2f}. Errors of one run hang together, so it may stay on one side for long. What is judged is the mean "
+        f"over the run, the ANEES: 3 is right, above {anees_bounds()[1]:.1f} is overconfident.",
         missing="The log has no ground truth.",
     )
     if content.ground_truth is None:

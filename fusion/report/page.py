@@ -23,11 +23,13 @@ from fusion.evaluation import common, errors_over_time
 from fusion.events import Event
 from fusion.imu import ImuCalibration
 from fusion.measurements import Mounting
+from fusion.placement import Placement, placement
 from fusion.report.content import ReportContent
 from fusion.report.figures import Figure, figures, sensor_stamps
 from fusion.report.verdict import Verdict, label, verdict
-from fusion.table import ROWS, final_sigma, number
+from fusion.table import ANEES_RULE, ROWS, final_sigma, number
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
+from fusion_io.words import counted
 
 SHOWN_EVENTS = 5  # of a kind; the others are folded away
 SIGNIFICANT = "%.5g"  # digits: far finer than a pixel
@@ -206,16 +208,18 @@ def _packed(data: bytes) -> str:
 
 
 def _verdict(line: Verdict) -> str:
-    return f'<p id="verdict" class="{line.status}">{escape(line.text)}</p>'
+    first, *others = map(escape, line.sentences)
+    rest = "".join(f" <span>{sentence}</span>" for sentence in others)
+    return f'<p id="verdict" class="{line.status}">{first}{rest}</p>'
 
 
 def _facts(content: ReportContent) -> str:
     """What was run over, in a line."""
     raw = content.trajectories["raw"]
     duration_s = (raw.stamps_ns[-1] - raw.stamps_ns[0]) / NANOSECONDS
-    facts = [f"{len(raw)} frames", f"{duration_s:.1f} s", f"{len(content.pairs)} pair estimates"]
+    facts = [counted(len(raw), "frame"), f"{duration_s:.1f} s", counted(len(content.pairs), "pair estimate")]
     if content.imu is not None and len(content.imu):
-        facts.append(f"{len(content.imu)} IMU samples")
+        facts.append(counted(len(content.imu), "IMU sample"))
     facts.append("with ground truth" if content.ground_truth is not None else "no ground truth")
     return escape(" · ".join(facts))
 
@@ -227,15 +231,13 @@ def _metrics(content: ReportContent) -> str:
     body = []
     for row in ROWS:
         measured = [values[name].get(row.key) for name in names]
-        known = [abs(value - row.right) for value in measured if value is not None]
-        if not known:
+        if all(value is None for value in measured):
             continue
         cells = [
             "<td>-</td>"
             if value is None
-            else f"<td{' class=best' if abs(value - row.right) == min(known) else ''}>"
-            f"{number(value * row.scale, row.decimals)}</td>"
-            for value in measured
+            else f"<td{' class=best' if best else ''}>{number(value * row.scale, row.decimals)}</td>"
+            for value, best in zip(measured, row.best(measured), strict=True)
         ]
         body.append(
             f"<tr><th scope=row>{escape(row.label)} <small>{escape(row.unit)}</small></th>{''.join(cells)}</tr>"
@@ -247,7 +249,8 @@ def _metrics(content: ReportContent) -> str:
         cells = [f"<td>{escape(cell(content.trajectories[name]))}</td>" for name in names]
         body.append(f"<tr><th scope=row>{what} <small>{unit}</small></th>{''.join(cells)}</tr>")
     head = "".join(f'<th scope=col><i class="key {name}"></i>{escape(label(name))}</th>' for name in names)
-    return f"<table class=numbers><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    rule = f"<p class=caption>Lower is better; {ANEES_RULE}.</p>" if any(content.metrics.values()) else ""
+    return f"<table class=numbers><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{rule}"
 
 
 def _calibration(content: ReportContent) -> str:
@@ -255,18 +258,9 @@ def _calibration(content: ReportContent) -> str:
     rows: list[tuple[str, str]] = []
     if (known := content.calibration) is not None:
         rows.append(("IMU", f"{'calibrated' if known.used else 'left out'}: {known.reason}"))
-        if known.rotation_imu_camera is not None:
-            quat = ", ".join(f"{part:.5f}" for part in known.rotation_imu_camera.as_quat(scalar_first=True))
-            std = ", ".join(f"{part:.3f}" for part in np.rad2deg(known.rotation_std_rad))
-            given = not np.any(known.rotation_std_rad)
-            rows.append(("mounting, v_imu = R v_camera", f"quaternion w x y z {quat}"))
-            rows.append(("its sigma about x, y, z", "given" if given else f"{std} deg"))
-        deviation = (
-            f" ± {1e3 * known.time_offset_std_s:.2f} ms" if known.time_offset_std_s else " (given or not estimated)"
-        )
-        rows.append(("time offset, IMU - camera", f"{1e3 * known.time_offset_s:.2f} ms{deviation}"))
-        if (refined := content.mounting) is not None:
-            rows += _refined(known, refined)
+        rows += _placement(placement(known, content.mounting))
+        if content.mounting is not None:
+            rows.append(("refined from", _moved(known, content.mounting)))
         bias = ", ".join(f"{1e3 * part:.3f}" for part in known.gyro_bias)
         estimated = f"{bias} mrad/s, sigma {1e3 * known.gyro_bias_std:.3f}"
         rows.append(("gyro bias x, y, z", estimated if np.any(known.gyro_bias) else "taken to be zero"))
@@ -274,16 +268,32 @@ def _calibration(content: ReportContent) -> str:
     return _pairs_table(rows)
 
 
-def _refined(known: ImuCalibration, refined: Mounting) -> list[tuple[str, str]]:
-    """What the pose graph made of the mounting."""
-    turned = np.rad2deg((known.mounting.inv() * refined.rotation_imu_camera).as_rotvec())
-    offset_s, offset_std_s = known.time_offset_s + refined.ahead_s, refined.ahead_std_s
-    values = (
-        ("refined mounting", turned, np.rad2deg(refined.rotation_std_rad), "deg from that, about x, y, z"),
-        ("refined time offset", np.array([1e3 * offset_s]), np.array([1e3 * offset_std_s]), "ms"),
-        ("lever arm", refined.lever_arm_m, refined.lever_arm_std_m, "m, the IMU in camera axes"),
+def _placement(known: Placement) -> list[tuple[str, str]]:
+    """How the IMU is mounted and what its clock reads, as metrics.json has it."""
+    rows = []
+    if known.rotation_imu_camera is not None:
+        quat = ", ".join(f"{part:.5f}" for part in known.rotation_imu_camera.as_quat(scalar_first=True))
+        rows.append(("mounting, v_imu = R v_camera", f"quaternion w x y z {quat}"))
+        if known.rotation_std_rad is None:
+            rows.append(("its sigma about x, y, z", "given"))
+        else:
+            std = ", ".join(f"{part:.3f}" for part in np.rad2deg(known.rotation_std_rad))
+            rows.append(("its sigma about x, y, z", f"{std} deg"))
+    std_s = known.time_offset_std_s
+    deviation = " (given or not estimated)" if std_s is None else f" ± {1e3 * std_s:.2f} ms"
+    rows.append(("time offset, IMU - camera", f"{1e3 * known.time_offset_s:.2f} ms{deviation}"))
+    if known.lever_arm_m is not None and known.lever_arm_std_m is not None:
+        arm = _with_std(known.lever_arm_m, known.lever_arm_std_m)
+        rows.append(("lever arm", f"{arm} m, the IMU in camera axes"))
+    return rows
+
+
+def _moved(known: ImuCalibration, refined: Mounting) -> str:
+    """How far refining moved what the calibration by the pairs, or a given value, began with."""
+    turned = ", ".join(
+        f"{angle:+.3f}" for angle in np.rad2deg((known.mounting.inv() * refined.rotation_imu_camera).as_rotvec())
     )
-    return [(name, f"{_with_std(found, std)} {unit}") for name, found, std, unit in values]
+    return f"a calibration {turned} deg about x, y, z and {1e3 * refined.ahead_s:+.2f} ms away"
 
 
 def _with_std(values: FloatArray, std: FloatArray) -> str:
@@ -302,7 +312,7 @@ def _events(content: ReportContent) -> str:
     for found in sorted(groups, key=lambda group: group[0].start_ns):
         kind, topic = kind_and_topic(found[0])
         lasted = sum(event.duration_s for event in found)
-        times = f"{len(found)} {'time' if len(found) == 1 else 'times'}, {lasted:.1f} s in all"
+        times = f"{counted(len(found), 'time')}, {lasted:.1f} s in all"
         title = f"{escape(kind)} <code>{escape(topic)}</code> <small>{times}</small>"
         parts.append(f'<h4><i class="key {_slug(kind)}"></i>{title}</h4>')
         parts.append(_event_rows(content, found[:SHOWN_EVENTS]))

@@ -1,33 +1,39 @@
-"""A run in one line: how good it is, and whether to trust it."""
+"""A run in a few sentences: whether something takes the result away, how good it is, where it ended."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from scipy.stats import chi2
 
-from fusion.evaluation import MIN_VARIANCE
+from fusion.evaluation import ANEES_DIMENSIONS, CONFIDENCE, MIN_VARIANCE, Metrics, consistency, errors_by_sigmas
 from fusion.report.content import ReportContent
 from fusion.table import HEADINGS
 from fusion_io.records import FloatArray, IntArray, Trajectory
+from fusion_io.words import counted, metres
 
 Status = Literal["good", "caution", "bad"]
 
 NIS_DEGREES_OF_FREEDOM = 6
-COVERAGE = 0.95  # of the bounds that are drawn and counted
-OVERCONFIDENT = 9.0  # an ANEES of 3 is right; beyond this, errors are sqrt(3) times what is stated
 DISAGREEMENT = 3.0  # standard deviations
+NAMED_DOUBTS = 3  # of a kind; of more it is said how many
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One line, and whether the eye should stop at it."""
+    """A few sentences, what weighs most first, and whether the eye should stop at them."""
 
-    text: str
+    sentences: Sequence[str]
     status: Status
+
+    @property
+    def text(self) -> str:
+        """All of it."""
+        return " ".join(self.sentences)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +64,63 @@ def label(name: str) -> str:
 
 
 def verdict(content: ReportContent) -> Verdict:
-    """The run in one line: against the ground truth where there is one, else by how consistent it is."""
+    """What to know of the run: doubts first, then how good it is, where the camera was at the end, and what was found.
+
+    It is judged against the ground truth where there is one, else by how consistent it is.
+    """
     faults = Counter(event.kind for event in content.events if event.is_fault)
+    doubted = doubts(content)
     accuracy, status = _accuracy(content) or _consistency(content)
-    parts = [accuracy, _imu(content)]
+    found = [_imu(content)]
     if faults:
-        parts.append(
+        found.append(
             "found " + ", ".join(kind if count == 1 else f"{kind} ({count})" for kind, count in faults.items())
         )
-    if warnings := len(content.warnings):
-        parts.append(f"{warnings} {_plural('warning', warnings)}")
-    text = "; ".join(parts)
-    caution = status == "good" and bool(faults or content.warnings)
-    return Verdict(text[0].upper() + text[1:] + ".", "caution" if caution else status)
+    if content.warnings:
+        found.append(counted(len(content.warnings), "warning"))
+    lines = (*doubted, accuracy, _end(content), "; ".join(found))
+    if any(each.is_lost for each in content.extrapolations):
+        status = "bad"
+    elif status == "good" and (doubted or faults or content.warnings):
+        status = "caution"
+    return Verdict([f"{line[0].upper()}{line[1:]}." for line in lines], status)
+
+
+def doubts(content: ReportContent) -> list[str]:
+    """What takes a part of the result away: poses that nothing measured, and a damaged log; in lines without a stop."""
+    holes = [each.line(content.start_ns) for each in content.extrapolations]
+    lines = holes[:NAMED_DOUBTS]
+    if more := holes[NAMED_DOUBTS:]:
+        lines.append(counted(len(more), "more such stretch", "more such stretches"))
+    if content.damage:
+        lines.append(_damage(content))
+    return lines
+
+
+def _damage(content: ReportContent) -> str:
+    named = content.damage[:NAMED_DOUBTS]
+    more = len(content.damage) - len(named)
+    last_s = content.second(int(content.trajectories["raw"].stamps_ns[-1]))
+    also = f"; and {counted(more, 'more fault')}" if more else ""
+    return f"the log is damaged: {'; '.join(named)}{also}; the result is of what could be read, until {last_s:.1f} s"
+
+
+def _end(content: ReportContent) -> str:
+    """Where the headline's trajectory ends, in the axes of the first camera (x right, y down, z ahead)."""
+    trajectory = content.trajectories[content.headline]
+    sides = (("right", "left"), ("below", "above"), ("ahead", "behind"))
+    places = [
+        f"{abs(value):.1f} m {side[bool(value < 0.0)]}"
+        for value, side in zip(trajectory.poses.translation[-1].tolist(), sides, strict=True)
+    ]
+    stated = _stated_at_end(trajectory)
+    sigma = "" if stated is None else f" (stated sigma {metres(stated)})"
+    return f"at the end the camera was {', '.join(places)} of where it began{sigma}"
+
+
+def _stated_at_end(trajectory: Trajectory) -> float | None:
+    """Root of the summed variances of the last position."""
+    return None if trajectory.covariances is None else float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:])))
 
 
 def agreements(content: ReportContent) -> list[Agreement]:
@@ -86,7 +136,7 @@ def agreements(content: ReportContent) -> list[Agreement]:
 
 def nis_bounds() -> tuple[float, float]:
     """Between which the normalised innovation squared of a pair is expected with 95 %."""
-    low, high = chi2.interval(COVERAGE, NIS_DEGREES_OF_FREEDOM)
+    low, high = chi2.interval(CONFIDENCE, NIS_DEGREES_OF_FREEDOM)
     return float(low), float(high)
 
 
@@ -98,32 +148,41 @@ def _accuracy(content: ReportContent) -> tuple[str, Status] | None:
         return None
     length_m = content.trajectories[name].path_length_m
     share = f" ({100.0 * metrics.ate_m / length_m:.2g} %)" if length_m > 0.0 else ""
-    text = f"{label(name)}: ATE {_metres(metrics.ate_m)} over {_metres(length_m)}{share}"
+    text = f"{label(name)}: ATE {metres(metrics.ate_m)} over {metres(length_m)}{share}"
     status: Status = "good"
     if name != "raw" and raw is not None and raw.ate_m is not None:
         worse = metrics.ate_m > raw.ate_m
-        text += f", {_compared(metrics.ate_m, raw.ate_m)} raw ({_metres(raw.ate_m)})"
+        text += f", {_compared(metrics.ate_m, raw.ate_m)} raw ({metres(raw.ate_m)})"
         status = "bad" if worse else status
-    if metrics.anees_position is not None:
-        overconfident = metrics.anees_position > OVERCONFIDENT
-        honest = "too small" if overconfident else "honest" if metrics.anees_position >= 1.0 else "cautious"
-        text += f"; its stated uncertainty is {honest} (ANEES {metrics.anees_position:.3g}, 3 is right)"
-        status = "caution" if overconfident and status == "good" else status
+    judged = _judged(metrics)
+    if judged:
+        text += f"; {', '.join(judged)}"
+    if status == "good" and any("overconfident" in each for each in judged):
+        status = "caution"
     return text, status
+
+
+def _judged(metrics: Metrics) -> list[str]:
+    """How many times the stated sigmas the errors of position and of orientation are, and what that is called."""
+    known = {"position": metrics.anees_position, "orientation": metrics.anees_orientation}
+    return [
+        f"its {what} errors are {errors_by_sigmas(value):.2g} times its sigmas: {consistency(value)} "
+        f"(ANEES {value:.3g}, {ANEES_DIMENSIONS} is right)"
+        for what, value in known.items()
+        if value is not None
+    ]
 
 
 def _consistency(content: ReportContent) -> tuple[str, Status]:
     """What can be said without ground truth."""
     name, status = content.headline, "good"
     trajectory = content.trajectories[name]
-    parts = [f"no ground truth to compare with; {label(name)}: {_metres(trajectory.path_length_m)}"]
-    if trajectory.covariances is not None:
-        parts[0] += f", stated sigma at the end {_metres(float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:]))))}"
+    parts = [f"no ground truth to compare with; {label(name)}: {metres(trajectory.path_length_m)}"]
     for each in agreements(content):
         if np.isfinite(each.worst):
             first, second = map(label, each.names)
             parts.append(
-                f"{first} and {second} differ by {_metres(float(np.max(each.distance_m)))} at most, "
+                f"{first} and {second} differ by {metres(float(np.max(each.distance_m)))} at most, "
                 f"{each.worst:.1f} sigma"
             )
             status = "caution" if each.worst > DISAGREEMENT else status
@@ -164,12 +223,3 @@ def _compared(value: float, other: float) -> str:
     if abs(value - other) < 0.01 * other:
         return "the same as"
     return "better than" if value < other else "worse than"
-
-
-def _metres(value: float) -> str:
-    """A length in metres, centimetres below one."""
-    return f"{value:.0f} m" if value >= 100.0 else f"{value:.1f} m" if value >= 10.0 else f"{value:.2f} m"
-
-
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,31 @@ from fusion_io.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, FusionEr
 
 STANDARD_OUTPUT = Path("-")
 """What a pipe is called where a file is asked for."""
+
+_called_as: ContextVar[str | None] = ContextVar("called_as", default=None)
+
+
+@contextmanager
+def called_as(name: str) -> Iterator[None]:
+    """Meanwhile commands are called by this name, such as ``violearner run``, and say so in their help."""
+    token = _called_as.set(name)
+    try:
+        yield
+    finally:
+        _called_as.reset(token)
+
+
+def command_parser(module: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    """The parser of a command, which its help calls as it was called: by another name or ``python -m MODULE``.
+
+    An epilog of several lines keeps them.
+    """
+    spelled = f"python -m {module}"
+    name = _called_as.get() or spelled
+    kept = argparse.RawDescriptionHelpFormatter if "\n" in epilog else argparse.HelpFormatter
+    return argparse.ArgumentParser(
+        prog=name, description=description, epilog=epilog.replace(spelled, name), formatter_class=kept
+    )
 
 
 def answered(job: Callable[[], int], interrupted: str = "") -> int:

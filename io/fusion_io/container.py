@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from fusion_io.errors import LogError
 from fusion_io.records import IntArray
+from fusion_io.words import counted
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the contents
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
@@ -98,6 +99,14 @@ class Contents:
     metadata: dict[str, dict[str, str]]
     damage: Sequence[Damage]
     messages_lost: int
+
+    def faults(self, path: Path) -> list[str]:
+        """A line for all that is wrong with the file; none where it is as it was written."""
+        lost = counted(self.messages_lost, "message")
+        return [
+            *(each.note for each in self.damage),
+            *([f"{path}: {lost} that it once held cannot be read"] if self.messages_lost else []),
+        ]
 
 
 class MessageFile:

@@ -12,13 +12,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.command import answered
+from fusion_io.command import answered, command_parser
 from fusion_io.errors import EXIT_OK, UsageError
+from fusion_io.words import counted
 
 if TYPE_CHECKING:
     from fusion_io.front_end_noise import FrontEndNoise
     from fusion_io.images import Framing
     from fusion_io.recording import Recording
+    from fusion_io.records import Trajectory
 
 # Modules that bring numpy, scipy or OpenCV are imported by the function that needs them, so that --help
 # and usage errors answer at once.
@@ -40,10 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m fusion_io.convert",
-        description="Convert a recording into a log.",
-        epilog="Exit codes: 0 the log is written, 1 it could not be, 2 usage, 130 interrupted.",
+    parser = command_parser(
+        "fusion_io.convert",
+        "Convert a recording into a log.",
+        "Exit codes: 0 the log is written, 1 it could not be, 2 usage, 130 interrupted.",
     )
     kinds = parser.add_subparsers(title="kinds of recording", required=True, metavar="KIND")
 
@@ -142,8 +144,11 @@ def _add_framing_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = """A trajectory becomes a log of pair estimates between its consecutive poses, so that any
         system's output can be fused. Formats: KITTI (12 numbers a line, or 13 with the frame's index in
-        front) and TUM (stamp tx ty tz qx qy qz qw)."""
-    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="the trajectory, KITTI or TUM")
+        front), TUM (stamp tx ty tz qx qy qz qw), and MCAP logs with odometry or poses."""
+    parser.add_argument(
+        "--poses", type=Path, required=True, metavar="FILE", help="the trajectory, KITTI, TUM or an MCAP log"
+    )
+    parser.add_argument("--topic", metavar="NAME", help="the topic of the poses, where an MCAP log has several")
     parser.add_argument(
         "--times",
         type=Path,
@@ -151,7 +156,7 @@ def _add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
         help="stamps of the frames in seconds, one a line (KITTI's times.txt); TUM needs none",
     )
     parser.add_argument(
-        "--imu", type=Path, metavar="FILE.mat", help="the sequence's IMU (or FILE.csv, EuRoC's columns)"
+        "--imu", type=Path, metavar="FILE.mat", help="the sequence's IMU (or FILE.csv, EuRoC's columns, or LOG.mcap)"
     )
     parser.add_argument("--ground-truth", type=Path, metavar="FILE", help="true poses, KITTI (with --times) or TUM")
     parser.add_argument(
@@ -264,7 +269,7 @@ def _convert(args: argparse.Namespace) -> int:
     recording.write(args.out, {"converter": _provenance(args)})
     print(f"{args.out}: {_summary(recording)}")
     if recording.warnings:
-        counts = ", ".join(f"{count} {what}" for what, count in sorted(recording.warnings.items()))
+        counts = ", ".join(f"{what}: {count}" for what, count in sorted(recording.warnings.items()))
         print(f"warning: {counts}", file=sys.stderr)
     return EXIT_OK
 
@@ -325,6 +330,7 @@ def _open_trajectory(args: argparse.Namespace) -> Recording:
     from fusion_io.folder import read_imu_csv
     from fusion_io.front_end_noise import with_noise
     from fusion_io.kitti import read_imu_mat
+    from fusion_io.reader import open_log
     from fusion_io.recording import Recording
     from fusion_io.trajectory_files import pair_estimates, read_times, read_trajectory
 
@@ -332,7 +338,7 @@ def _open_trajectory(args: argparse.Namespace) -> Recording:
         raise UsageError("--noise-rotation-drift: there is no noise without --noise-seed")
     stamps_ns = None if args.times is None else read_times(args.times)
     recording = Recording()
-    poses = read_trajectory(args.poses, stamps_ns)
+    poses = _recorded_poses(args.poses, args.topic) if _is_log(args.poses) else read_trajectory(args.poses, stamps_ns)
     recording.pairs = pair_estimates(poses, args.sigma_translation, args.sigma_rotation)
     if args.noise_seed is not None:
         recording.pairs = with_noise(recording.pairs, args.noise_seed, _front_end_noise(args))
@@ -341,11 +347,27 @@ def _open_trajectory(args: argparse.Namespace) -> Recording:
         recording.ground_truth = read_trajectory(args.ground_truth, stamps_ns)
     if args.imu is not None and args.imu.suffix.lower() == ".csv":
         recording.imu = read_imu_csv(args.imu, recording.warnings)
+    elif args.imu is not None and _is_log(args.imu):
+        recording.imu = open_log(args.imu).imu()
     elif args.imu is not None:
         if stamps_ns is None:
             raise UsageError(f"{args.imu}: has no times of its own: give --times")
         recording.imu = read_imu_mat(args.imu, stamps_ns)
     return recording
+
+
+def _is_log(path: Path) -> bool:
+    return path.suffix.lower() == ".mcap"
+
+
+def _recorded_poses(path: Path, topic: str | None) -> Trajectory:
+    """The odometry or the poses of a log; what of it was left out is said on stderr."""
+    from fusion_io.odometry import read_trajectories, trajectory_on
+
+    recorded = read_trajectories(path)
+    for note in recorded.notes:
+        print(f"warning: {note}", file=sys.stderr)
+    return trajectory_on(path, recorded, topic)
 
 
 def _front_end_noise(args: argparse.Namespace) -> FrontEndNoise:
@@ -379,13 +401,14 @@ def _text(value: object) -> str:
 
 def _summary(recording: Recording) -> str:
     counts = {
-        "frames": recording.frame_count,
-        "pairs": len(recording.pairs),
-        "IMU samples": 0 if recording.imu is None else len(recording.imu),
-        "ground-truth poses": 0 if recording.ground_truth is None else len(recording.ground_truth),
-        "GNSS fixes": len(recording.gnss),
+        "frame": recording.frame_count,
+        "pair": len(recording.pairs),
+        "IMU sample": 0 if recording.imu is None else len(recording.imu),
+        "ground-truth pose": 0 if recording.ground_truth is None else len(recording.ground_truth),
+        "GNSS fix": len(recording.gnss),
     }
-    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    many = {"GNSS fix": "GNSS fixes"}
+    return ", ".join(counted(count, what, many.get(what, "")) for what, count in counts.items() if count)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from fusion_io.container import Channel, Contents, MessageFile
 from fusion_io.errors import LogError
 from fusion_io.records import Trajectory
 from fusion_io.recovery import scan
+from fusion_io.words import counted
 
 POSE_TYPES = (messages.ODOMETRY, messages.POSE_STAMPED, messages.POSE_WITH_COVARIANCE)
 
@@ -48,7 +49,8 @@ def read_trajectories(path: Path) -> RecordedTrajectories:
     for topic in sorted(contents.index, key=_order):
         trajectory, left_out = _read(path, contents, channels[topic])
         if left_out:
-            notes.append(f"{path}: {topic}: {left_out} poses are left out: unreadable, invalid or out of order")
+            what = counted(left_out, "pose is", "poses are")
+            notes.append(f"{path}: {topic}: {what} left out: unreadable, invalid or out of order")
         if len(trajectory) > 1:
             found[topic] = trajectory
     ground_truth = found.pop(topics.GROUND_TRUTH, None)
@@ -56,7 +58,7 @@ def read_trajectories(path: Path) -> RecordedTrajectories:
     for topic, trajectory in found.items():
         name = name_of(topic)
         named[name if name not in named else f"{name}_{len(named)}"] = trajectory
-    damaged = bool(contents.damage or contents.messages_lost)
+    damaged = bool(contents.faults(path))
     return RecordedTrajectories(named, ground_truth, contents.metadata, damaged, tuple(notes))
 
 
@@ -89,6 +91,23 @@ def _read(path: Path, contents: Contents, channel: Channel) -> tuple[Trajectory,
                 samples.append((stamp_ns, messages.decode_pose(message_type, file.read(index, i))))
     trajectory, _, _ = poses.in_order(samples)
     return trajectory, len(stamps_ns) - len(trajectory)
+
+
+def trajectory_on(path: Path, recorded: RecordedTrajectories, topic: str | None) -> Trajectory:
+    """The trajectory on a topic, or without one the only trajectory that a log holds.
+
+    Raises LogError, with those that there are, where it holds none on the topic, or several and none is named.
+    """
+    known = dict(recorded.trajectories)
+    if recorded.ground_truth is not None:
+        known[name_of(topics.GROUND_TRUTH)] = recorded.ground_truth
+    if topic is None and len(known) == 1:
+        return next(iter(known.values()))
+    if topic is not None and name_of(topic) in known:
+        return known[name_of(topic)]
+    asked = "which of its trajectories?" if topic is None else f"no trajectory on {topic}."
+    choose = "; choose one with --topic" if known else ""
+    raise LogError(f"{path}: {asked} It holds {', '.join(known) or 'none'}{choose}")
 
 
 def only_trajectory(path: Path, recorded: RecordedTrajectories) -> Trajectory:

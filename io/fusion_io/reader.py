@@ -69,7 +69,8 @@ class Log:
         roles: Role -> topic: image, depth, camera_info, imu (or gyro and accelerometer), ground_truth, pairs, loops,
             gnss, tf_static; those that the log has.
         metadata: Named records of text fields.
-        damaged: Whether the file is not as it was written: cut, unfinished, or with bad chunks.
+        damage: A line for all that is wrong with the file: that it is cut, unfinished, or has bad chunks.
+        damaged: Whether there is any.
         start_ns: The first stamp of the camera, or of what there is in its place, and of all that overlaps with it.
         end_ns: The last.
 
@@ -78,7 +79,8 @@ class Log:
     def __init__(self, path: Path, contents: Contents, chosen: Mapping[str, str]):
         self.path = path
         self.metadata = contents.metadata
-        self.damaged = bool(contents.damage or contents.messages_lost)
+        self.damage = contents.faults(path)
+        self.damaged = bool(self.damage)
         self._contents = contents
         self._channels = {channel.topic: channel for channel in contents.counts if _readable(channel)}
         self._types = {topic: encodings.ros2_type(channel) for topic, channel in self._channels.items()}
@@ -302,7 +304,7 @@ class Log:
         self._report(f"{role}_invalid", role, np.array(invalid), "without a valid pose and covariance are left out")
         valid = {(pair.target_stamp_ns, pair.source_stamp_ns): pair for pair in reversed(estimates) if _is_valid(pair)}
         again = len(estimates) - len(invalid) - len(valid)
-        self._findings.put(f"duplicate_{role}", again, f"{self._named(role)}: {again} messages repeat a pair")
+        self._findings.put(f"duplicate_{role}", again, f"{self._named(role)}: messages that repeat a pair: {again}")
         return [valid[key] for key in sorted(valid)]
 
     def estimator(self, name: str) -> EstimatorSeries | None:
@@ -455,7 +457,7 @@ class Log:
     def _report(self, name: str, role: str, stamps: IntArray, what: str) -> None:
         """Count messages of a role, by their stamps."""
         first = f", the first at {_seconds(stamps[0])}" if len(stamps) else ""
-        self._findings.put(name, len(stamps), f"{self._named(role)}: {len(stamps)} messages {what}{first}")
+        self._findings.put(name, len(stamps), f"{self._named(role)}: messages {what}: {len(stamps)}{first}")
 
     def _report_late(self, role: str, stamps: IntArray) -> None:
         self._report(f"{role}_backward", role, stamps, "that go back in time or repeat a stamp are left out")
@@ -469,8 +471,7 @@ class Log:
     def _report_damage(self) -> None:
         for damage in self._contents.damage:
             self._findings.add(damage.name, damage.note)
-        lost = self._contents.messages_lost
-        self._findings.put("messages_lost", lost, f"{self.path}: {lost} messages that it once held cannot be read")
+        self._findings.put("messages_lost", self._contents.messages_lost, self.damage[-1] if self.damage else "")
 
     def _report_clocks(self) -> None:
         for role, topic in self.roles.items():

@@ -33,6 +33,7 @@ from fusion_io.container import MESSAGE, RECORD, Block, Channel, Contents, Damag
 from fusion_io.errors import LogError
 from fusion_io.messages import header_stamp
 from fusion_io.records import NANOSECONDS
+from fusion_io.words import counted
 
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, size and CRC of the contents, length of the next string
 _DATA_LENGTH = struct.Struct("<Q")
@@ -407,7 +408,7 @@ class _Scan:
             Damage(
                 "bad_chunks",
                 f"{self._path}: the chunk {chunk.where} is damaged ({chunk.reason})"
-                + (f", {chunk.messages_lost} messages lost" if chunk.messages_lost else ""),
+                + (f", {counted(chunk.messages_lost, 'message')} lost" if chunk.messages_lost else ""),
             )
             for chunk in self._bad_chunks
         ]

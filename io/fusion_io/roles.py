@@ -100,19 +100,30 @@ def assign(path: str, candidates: Sequence[Topic], chosen: Mapping[str, str]) ->
     """Role -> topic, for all roles that the log can fill.
 
     Raises:
-        LogError: two topics could play a role, or a chosen one is not there or does not fit.
+        LogError: two topics could play a role (all such roles are named), or a chosen one is not there or does not fit.
         UsageError: a role that does not exist was chosen.
 
     """
     roles = {role: _chosen(path, candidates, role, topic) for role, topic in chosen.items()}
-    if not roles.keys() & set(_INERTIAL):
-        roles |= _inertial(path, candidates)
+    found = {} if roles.keys() & set(_INERTIAL) else _inertial(candidates)
+    roles |= {role: fitting[0].name for role, fitting in found.items() if len(fitting) == 1}
     for role in CANONICAL:
         if role not in roles and role != "imu":
-            topic = _only(path, role, _fitting(role, candidates, roles))
-            if topic:
-                roles[role] = topic
+            found[role] = _fitting(role, candidates, roles)
+            if len(found[role]) == 1:
+                roles[role] = found[role][0].name
+    choices = {role: fitting for role, fitting in found.items() if len(fitting) > 1}
+    if "image" in choices:
+        choices.pop("camera_info", None)  # it may be told by the image that is chosen
+    if choices:
+        raise LogError(f"{path}: {'; '.join(_choice(role, fitting) for role, fitting in choices.items())}")
     return roles
+
+
+def could_play(role: str, topic: str, message_type: str, kind: str) -> bool:
+    """Whether a topic of this kind (`kind_of`) could be chosen for a role that it is not found for by itself."""
+    ours = topic in CANONICAL.values() or topic.startswith(topics.ODOMETRY_PREFIX)
+    return message_type in _READABLE[role] and kind in {"", role} and not ours
 
 
 def _chosen(path: str, candidates: Sequence[Topic], role: str, topic: str) -> str:
@@ -146,23 +157,22 @@ def _camera_info_names(image_topic: str) -> set[str]:
     return {f"{namespace}/camera_info", f"{namespace.rsplit('/', 1)[0]}/camera_info"}
 
 
-def _inertial(path: str, candidates: Sequence[Topic]) -> dict[str, str]:
-    """One topic with both halves of an IMU, or one topic each."""
+def _inertial(candidates: Sequence[Topic]) -> dict[str, list[Topic]]:
+    """The topics that could have both halves of an IMU, or those that could have one each."""
     whole = _fitting("imu", candidates, {})
     gyros = [candidate for candidate in candidates if candidate.kind == "gyro"]
     accelerometers = [candidate for candidate in candidates if candidate.kind == "accelerometer"]
     if gyros and accelerometers and not whole:
-        return {"gyro": _only(path, "gyro", gyros), "accelerometer": _only(path, "accelerometer", accelerometers)}
-    topic = _only(path, "imu", whole or gyros or accelerometers)
-    return {"imu": topic} if topic else {}
+        return {"gyro": gyros, "accelerometer": accelerometers}
+    return {"imu": whole or gyros or accelerometers}
 
 
-def _only(path: str, role: str, fitting: Sequence[Topic]) -> str:
-    if len(fitting) > 1:
-        raise LogError(
-            f"{path}: {len(fitting)} topics could be the {_words(role)}: {_list(fitting)}; choose one ({role}=TOPIC)"
-        )
-    return fitting[0].name if fitting else ""
+def _choice(role: str, fitting: Sequence[Topic]) -> str:
+    """What is to be chosen, and how."""
+    return (
+        f"{len(fitting)} topics could be the {_words(role)}: {_list(fitting)}; "
+        f"choose one, such as --topic {role}={fitting[0].name}"
+    )
 
 
 def _words(role: str) -> str:

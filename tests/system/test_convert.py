@@ -88,7 +88,7 @@ def test_an_odometry_sequence_becomes_a_log(odometry, tmp_path, capsys):
     assert main(["kitti-odometry", f"--root={odometry}", f"--imu={odometry / 'imu/06.mat'}", *arguments]) == 0
     captured = capsys.readouterr()
     assert captured.out.startswith(f"{out}: 3 frames, ")
-    assert captured.err == "warning: 3 frames missing (no left image)\n"
+    assert captured.err == "warning: frames missing (no left image): 3\n"
 
     log = open_log(out)
     frames = list(log.frames())
@@ -128,7 +128,7 @@ def test_the_scanner_of_a_sequence_gives_the_depth_of_the_log(odometry, tmp_path
     out = tmp_path / "06.mcap"
     arguments = ["--sequence=06", "--frames=0:2", "--resize=240x64", "--depth=velodyne", f"--out={out}"]
     assert main(["kitti-odometry", f"--root={tmp_path}", *arguments]) == 0
-    assert capsys.readouterr().err == "warning: 1 frames without depth (no scan)\n"
+    assert capsys.readouterr().err == "warning: frames without depth (no scan): 1\n"
     log = open_log(out)
     first, second = log.frames()
     assert first.depth.shape == (64, 240)
@@ -142,7 +142,7 @@ def test_a_raw_drive_becomes_a_log_with_its_mounting(shared_data, tmp_path, caps
     drive = shared_data / "kitti/raw/2011_09_26/2011_09_26_drive_0039_sync"
     out = tmp_path / "39.mcap"
     assert main(["kitti-raw", f"--drive={drive}", "--frames=17:20", "--resize=310x94", f"--out={out}"]) == 0
-    assert "1 frames missing (no left image), 1 frames without depth" in capsys.readouterr().err
+    assert "frames missing (no left image): 1, frames without depth" in capsys.readouterr().err
     log = open_log(out)
     assert [frame.depth is None for frame in log.frames()] == [True, False]
     assert_allclose(log.mounting().apply([0, 0, 1]), [1, 0, 0], atol=0.03)

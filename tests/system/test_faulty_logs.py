@@ -81,3 +81,30 @@ def test_a_refused_log_leaves_no_empty_folder_but_takes_none_away(
         out.mkdir()
     assert run.main(["--log", str(log), "--out", str(out)]) == 1
     assert out.exists() == exists
+
+
+def test_after_a_hole_in_everything_printout_and_page_call_the_pose_lost(
+    tmp_path: Path, drive: faults.Log, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start_ns = drive.pairs[0].source_stamp_ns
+    seconds = (drive.imu.stamps_ns - start_ns) / NANOSECONDS
+    kept = (seconds < 20.0) | (seconds >= 32.0)
+    imu = replace(
+        drive.imu,
+        stamps_ns=drive.imu.stamps_ns[kept],
+        angular_velocity=drive.imu.angular_velocity[kept],
+        linear_acceleration=drive.imu.linear_acceleration[kept],
+    )
+    pairs = [
+        pair
+        for pair in drive.pairs
+        if pair.target_stamp_ns <= start_ns + 20 * NANOSECONDS or pair.source_stamp_ns >= start_ns + 32 * NANOSECONDS
+    ]
+    holed = replace(drive, imu=imu, pairs=pairs)
+    with LogWriter(tmp_path / "log.mcap") as log:
+        log.imu(holed.imu)
+        log.pairs(holed.pairs)
+    assert run.main(["--log", str(tmp_path / "log.mcap"), "--out", str(tmp_path)]) == 0
+    lost = "The absolute pose is lost after 20.0 s: nothing measured the motion from 20.0 to 32.0 s"
+    assert lost in capsys.readouterr().out
+    assert f'<p id="verdict" class="bad">{lost}' in (tmp_path / "report.html").read_text()
