@@ -36,6 +36,7 @@ from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.pair_model import camera
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
+from fusion_io.words import counted
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first direction of gravity
@@ -577,7 +578,7 @@ def _note(
 ) -> str:
     measured = sum(window is not None for window in windows)
     imu = f"pairs only: {without_imu}" if not measured else f"IMU on {measured} of {len(windows)} steps"
-    skipping = f"; {skips} pairs that skip a frame" if skips else ""
+    skipping = f"; {counted(skips, 'pair that skips a frame', 'pairs that skip a frame')}" if skips else ""
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
     return imu + skipping + rejected + loops

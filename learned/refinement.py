@@ -38,6 +38,9 @@ POINTS = 4096
 LEAST_GRADIENT = 2.0
 """Grey levels a pixel: less is noise, and says nothing about motion."""
 
+LEAST_WITHIN, GAP = 0.5, 9
+"""Depth is sparse where less than this share of it has depth all about it; then it has gaps of up to so many pixels."""
+
 COARSEST_WIDTH = 120
 """Images are halved while they stay at least this wide."""
 
@@ -122,10 +125,10 @@ def with_gradients(image: NDArray[np.float32]) -> Tensor:
 
 
 def select_points(image: NDArray[np.float32], depth: NDArray[np.float32], K: FloatArray) -> Points:
-    """The pixel with the steepest gradient of every cell, if it has depth and is steep enough."""
+    """The pixel with the steepest gradient of every cell, if it has depth, inside of what has, and is steep enough."""
     steepness = np.abs(cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8))
     steepness += np.abs(cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8))
-    steepness *= depth > NEAREST_DEPTH_M  # false for NaN as well
+    steepness *= inside(depth > NEAREST_DEPTH_M)  # false for NaN as well
     cell = max(1, round((image.size / POINTS) ** 0.5))
     steepest, index = functional.max_pool2d(torch.from_numpy(steepness)[None], cell, return_indices=True)
     index = index.flatten()
@@ -134,6 +137,21 @@ def select_points(image: NDArray[np.float32], depth: NDArray[np.float32], K: Flo
     z = torch.from_numpy(np.nan_to_num(depth.ravel()[index.numpy()], nan=1.0, posinf=1.0)).clamp(min=NEAREST_DEPTH_M)
     ray = (pixel - torch.from_numpy(K[:2, 2]).float()) / torch.from_numpy(K[[0, 1], [0, 1]]).float()
     return Points(pixel, torch.cat([ray * z[:, None], z[:, None]], dim=1), used)
+
+
+def inside(measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which pixels (H, W) have depth, as has all about them.
+
+    Beside what has none, the sky for one, a pixel shows two surfaces, and its edge moves with the brightness of either.
+    It would turn every estimate the same way (on rendered streets by 0.1 mrad, four times what is left). Where depth is
+    sparse there are gaps everywhere, which mean nothing.
+    """
+    around, gaps = np.ones((3, 3), np.uint8), np.ones((GAP, GAP), np.uint8)
+    regions = measured.astype(np.uint8)
+    within = regions & cv2.erode(regions, around)
+    if within.sum() < LEAST_WITHIN * regions.sum():
+        within = regions & cv2.erode(cv2.morphologyEx(regions, cv2.MORPH_CLOSE, gaps), around)
+    return np.asarray(within, np.bool_)
 
 
 def refine(

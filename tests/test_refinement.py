@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 
 from fusion_io import simulation
 from fusion_io.records import CameraFrame, CameraInfo, FloatArray
-from learned.refinement import FullFrame, Problem, Refined, prepare_full, refine, with_gradients
+from learned.refinement import FullFrame, Problem, Refined, inside, prepare_full, refine, with_gradients
 
 SIGMAS = np.array([3e-3, 3e-3, 3e-3, 0.06, 0.06, 0.06])
 PRIOR = np.diag(SIGMAS**2)
@@ -138,6 +138,21 @@ def test_pairs_do_not_see_each_other() -> None:
     for i, (frames, _) in enumerate(made):
         alone = refined(frames, starts[i])
         np.testing.assert_allclose(together.T_source_target[i], alone.T_source_target[0], atol=1e-4)
+
+
+def test_the_edge_of_what_has_depth_takes_no_part_but_gaps_of_sparse_depth_do_not_matter() -> None:
+    dense = np.zeros((40, 60), np.bool_)
+    dense[10:30, 20:50] = True
+    expected = np.zeros_like(dense)
+    expected[11:29, 21:49] = True
+    np.testing.assert_array_equal(inside(dense), expected)
+    sparse = np.zeros_like(dense)
+    sparse[10:30:3, 20:50:2] = True  # lines of a LiDAR
+    within = inside(sparse)
+    assert not np.any(within & ~sparse)
+    assert within.sum() > 0.6 * sparse.sum()
+    assert not within[10].any()  # the uppermost line is the edge
+    assert not inside(np.zeros_like(dense)).any()
 
 
 def test_depth_that_is_nan_or_missing_takes_no_part() -> None:
