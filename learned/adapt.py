@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_io.command import answered
+from fusion_io.command import answered, command_parser
 from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError
 from learned.train import positive_integer
 
@@ -72,8 +72,8 @@ class Adapted:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m learned.adapt",
+    parser = command_parser(
+        "learned.adapt",
         description="Train a network further on a log's own photometric error, without labels.",
         epilog="Exit codes: 0 all well, also if it does not help, 1 nothing could be computed, 2 usage, "
         "3 computed from a damaged log.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from fusion_io.ahead import computed_ahead
 from fusion_io.records import CameraFrame, FloatArray, ImuSeries, IntArray, PairEstimate
 from learned import weights as weights_file
 from learned.covariance import hypothesis_spread, pooled
@@ -36,7 +37,6 @@ LONGEST_STEP = 1.5
 """Frames further apart than this many median frame periods have a missing frame between them."""
 
 Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 class FrameSource(Protocol):
@@ -185,17 +185,6 @@ def prefetched(items: Iterator[Item], count: int) -> Iterator[Item]:
         while (item := waiting.popleft().result()) is not end:
             waiting.append(pool.submit(next, items, end))
             yield item  # type: ignore[misc]
-
-
-def computed_ahead(function: Callable[[Item], Result], items: Iterable[Item], count: int) -> Iterator[Result]:
-    """The function of each item, in order, computed by `count` threads at the same time."""
-    with ThreadPoolExecutor(count) as pool:
-        waiting: deque[Future[Result]] = deque()
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) > count:
-                yield waiting.popleft().result()
-        yield from (each.result() for each in waiting)
 
 
 def consecutive(

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
-from fusion_io.command import STANDARD_OUTPUT, answered, write_json
+from fusion_io.command import STANDARD_OUTPUT, answered, command_parser, write_json
 from fusion_io.errors import EXIT_DAMAGED, EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ TIMED = ("seconds_per_pair", "cpu_seconds_per_pair")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m learned.evaluate",
+    parser = command_parser(
+        "learned.evaluate",
         description="Errors and consistency of pair estimates on a log with ground truth.",
         epilog="Exit codes: 0 all well, 1 nothing could be computed, 2 usage, 3 computed from a damaged log.",
     )

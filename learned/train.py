@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fusion_io.command import answered
+from fusion_io.command import answered, command_parser
 from fusion_io.errors import EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ class Source:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m learned.train",
+    parser = command_parser(
+        "learned.train",
         description=__doc__.split("\n\n")[0],
         epilog="Exit codes: 0 all well, 1 nothing could be computed, 2 usage, 130 interrupted (run again to go on).",
     )

@@ -71,9 +71,7 @@ def test_an_interrupted_command_ends_with_130(
     assert capsys.readouterr().err == "interrupted\n"
 
 
-@pytest.mark.parametrize(
-    "name", [name for name, (module, _) in cli.COMMANDS.items() if not module.startswith("learned")]
-)
+@pytest.mark.parametrize("name", cli.COMMANDS)
 def test_help_and_usage_errors_show_the_command_as_it_was_called(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["--help"], ["--no-such-option"]):
         with pytest.raises(SystemExit):

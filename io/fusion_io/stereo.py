@@ -7,17 +7,16 @@ implements it.
 from __future__ import annotations
 
 import os
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_io.ahead import computed_ahead
 from fusion_io.errors import LogError
 from fusion_io.images import Framing, read_image
 from fusion_io.records import CameraFrame, CameraInfo, FloatArray
@@ -131,7 +130,7 @@ def stereo_frames(
             raise LogError(f"{pair.right}: not of the same size as the left image")
         return pair, left, rig.depth(left, right)
 
-    for pair, left, depth in _ahead(load, pairs):
+    for pair, left, depth in computed_ahead(load, pairs, os.cpu_count() or 1):
         if left is None:
             warnings["frames skipped (left image cannot be decoded)"] += 1
             continue
@@ -147,20 +146,3 @@ def stereo_frames(
             None if depth is None else framing.depth(depth),
             framing.camera(CameraInfo(width, height, rig.K)),
         )
-
-
-A = TypeVar("A")
-B = TypeVar("B")
-
-
-def _ahead(function: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
-    """Map in threads (OpenCV lets go of the interpreter), in order, a few results ahead of the consumer."""
-    workers = os.cpu_count() or 1
-    with ThreadPoolExecutor(workers) as pool:
-        pending: deque[Future[B]] = deque()
-        for item in items:
-            pending.append(pool.submit(function, item))
-            if len(pending) > workers:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
