@@ -162,7 +162,8 @@ is causal: a loop moves its present alone, and in hindsight (smoothed) the way t
     "rendered": """\
 Streets are simulated along the real trajectories, with depth from stereo and moving cars, and the real IMU. The network
 estimates the pairs, and loops are looked for in the images. Loops are wrong that are more than 0.5 m or 2 deg off. The
-filter is causal: a loop moves its present alone, and in hindsight (smoothed) the way there.""",
+filter is causal: a loop moves its present alone, and in hindsight (smoothed) the way there. Images that are rendered
+along a trajectory agree with it better than its real IMU does, so that between loops raw is hard to beat.""",
     "wrong": """\
 A fifth of the loops are given another source, a frame from anywhere before, as where two places look alike. The change
 is against the run with all loops right, so it includes what the loops that were replaced would have told; beside it is
