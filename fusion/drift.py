@@ -137,7 +137,7 @@ class Map:
         least = since @ joint @ since.T
         self._latest_covariance = odometry.joint[6:, 6:]
         grown = self._latest_covariance - back @ self._odometry_covariance @ back.T
-        own = least + _positive(grown - least)
+        own = _positive(least) + _positive(grown - least)  # an odometry may get surer; what drifted has drifted
         self._places.append(_Place(len(self._keyframes) - 1, odometry.T, own, self._latest_covariance))
         if not self._closed:
             return Pose(odometry.T, self._latest_covariance)
@@ -169,9 +169,9 @@ class Map:
         rows = self._rows(-1) - self._rows(source)
         of_latest = self._between(-1, -1) + own
         with_latest = of_latest - self._between(-1, source)
-        spread = with_latest - self._between(source, -1) + self._between(source, source) + own_source
-        spread += to_world @ loop.covariance @ to_world.T
-        root = np.linalg.cholesky((spread + spread.T) / 2)
+        apart = with_latest - self._between(source, -1) + self._between(source, source) + own_source
+        # Of many loops, rounding makes the difference of large covariances anything but one.
+        root = np.linalg.cholesky(_positive(apart) + to_world @ loop.covariance @ to_world.T)
         beyond, rows, row = (solve_triangular(root, each, lower=True) for each in (beyond, rows, with_latest.T))
         if beyond @ beyond > self._gate:
             return None

@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
-from fusion.drift import Closures, Odometry
+from fusion.drift import Closures, Map, Odometry
 from fusion_io.records import NANOSECONDS, FloatArray, PairEstimate, Trajectory
 
 FRAMES = 81  # at 10 Hz, so that every twentieth is a keyframe
@@ -91,3 +91,16 @@ def test_a_wrong_loop_moves_nothing() -> None:
     assert closures.used.tolist() == [False]
     assert closures.note == "; loops used: 0 of 1"
     assert_allclose(bent.poses.translation, odometry.poses.translation, atol=1e-12)
+
+
+def test_an_odometry_that_gets_surer_does_not_take_from_the_maps_covariance() -> None:
+    """By rounding, or by what it learns later: loop after loop the map's covariance stays one."""
+    drifted, learned = Map(1e-6), 1e-3 * np.eye(6)
+    for k in range(1, 60):
+        before, T = 0.1 * np.eye(6) - k * learned, np.eye(4)
+        T[2, 3] = k
+        drifted.move_to(Odometry(T, np.block([[before, before], [before, before - learned]])))
+        drifted.keep()
+        loop = PairEstimate(0, int(STAMPS[1]), np.eye(4)[0], T[:3, 3], np.diag(LOOP_SIGMA**2))
+        assert drifted.close(0, loop) is not None
+        assert all(np.linalg.eigvalsh(pose.covariance)[0] > -1e-12 for pose in drifted.hindsight())
