@@ -404,8 +404,8 @@ class Filter:
         """Move on by a motion that is no more than an extrapolation, after which it is unknown which way the world is.
 
         No linear update bears an attitude that is uncertain by about a radian, and none need: what was known of the
-        world turns about the present position by one unknown rotation, which no measurement feels. It widens the
-        covariances of the poses that follow. Gravity is looked for anew.
+        world turns about the last position that was measured by one unknown rotation, which no measurement feels. It
+        widens the covariances of the poses that follow. Gravity is looked for anew.
         """
         state, to_imu = self.state, self.state.T_camera_imu
         moved = inverse(to_imu) @ measured.motion @ to_imu
