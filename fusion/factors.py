@@ -53,9 +53,13 @@ class Batch(ABC):
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """Add the factors to a graph."""
+        for row in range(len(self._keys)):
+            graph.add(self.factor(row))
+
+    def factor(self, row: int) -> gtsam.NonlinearFactor:
+        """One of the factors."""
         noise = gtsam.noiseModel.Unit.Create(self.dimension)
-        for row, keys in enumerate(self._keys):
-            graph.add(gtsam.CustomFactor(noise, list(keys), self._lookup(row)))
+        return gtsam.CustomFactor(noise, list(self._keys[row]), self._lookup(row))
 
     def _lookup(self, row: int) -> Callable[..., FloatArray]:
         def look_up(_: gtsam.CustomFactor, __: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:

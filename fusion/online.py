@@ -238,7 +238,7 @@ class Smoother:
             gtsam.PriorFactorVector(E(0), strayed, gtsam.noiseModel.Gaussian.Covariance(covariance)),
         ]
         self._world = WorldFactor(self._T_camera_imu, self._twist[None], FIRST_POSE_SIGMA)
-        self._factors.append(_factor_of(self._world))
+        self._factors.append(self._world.factor(0))
 
     def _mounting_prior(self, calibration: ImuCalibration) -> tuple[FloatArray, FloatArray]:
         """E(0) (10,) and its covariance: as a back end has refined it, as the calibration found it, or as given."""
@@ -453,13 +453,6 @@ class Smoother:
     def _first_of_knot(self, key: int, oldest: int) -> int:
         """The first frame that needs a variable like this one while `oldest` is in the window."""
         return self._begins[self._knots[oldest]] if chr(gtsam.Symbol(key).chr()) in "bs" else oldest
-
-
-def _factor_of(batch: WorldFactor) -> gtsam.NonlinearFactor:
-    """The only factor of a batch."""
-    graph = gtsam.NonlinearFactorGraph()
-    batch.add_to(graph)
-    return graph.at(0)
 
 
 def _first_bias(calibration: ImuCalibration) -> gtsam.imuBias.ConstantBias:

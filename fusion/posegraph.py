@@ -2,8 +2,9 @@
 
 Variables: the poses X of the IMU in the first camera's frame, its velocities V and biases B, the direction of gravity
 G, how it is mounted and what its clock reads E, and the lasting errors S of the front end, one state a second; with
-satellite positions also where on the earth the world is U, and where the antenna is L. The first camera is the world:
-X(0) is tied to E, so that the covariances of the camera's poses are those relative to it.
+satellite positions also where on the earth the world is U, and where the antenna is L. While the solution is looked
+for, X(0) stands still; then the world is moved to the first camera, and X(0) tied to E, so that the covariances of the
+camera's poses are those relative to it.
 Without an IMU the poses are those of the camera, and without loops or positions the solution is the raw trajectory.
 
 Preintegration: Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", 2017. Linear
@@ -33,7 +34,7 @@ from fusion.config import PoseGraphConfig, Robust
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Measurements, Mounting
-from fusion.pair_model import camera
+from fusion.pair_model import camera, inverse
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
 from fusion_io.words import counted
@@ -51,8 +52,7 @@ MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance i
 
 MAX_ITERATIONS = 30
 FORGIVING_ITERATIONS = 2  # before anything is judged
-# Root mean square of how far a step moves the camera, in m and as a share of its way, that ends the iteration.
-CONVERGED, CONVERGED_SHARE = 3e-4, 1e-6
+CONVERGED = 0.1  # of what a step lowers the squares by: it moves nothing by more than a third of its sigma
 ANNEALING = 4.0  # of the kernel's width from step to step; by larger steps wrong loops drag good pairs out with them
 REJECTED_WEIGHT = 1e-4  # of a step whose pair is left out: no more than a hint, where nothing else is known
 
@@ -64,8 +64,9 @@ Tree = TypeVar("Tree")  # what elimination makes of a graph
 class Problem:
     """A graph, where its solution is looked for from, and those of its factors that are evaluated together.
 
-    T_camera_imu (4, 4): what E(0) strays from. twists (K, 6): of the IMU at the stamps of the poses, or None where the
-    poses are those of the camera. knots (K,): the front end's state at each stamp.
+    The first factor holds X(0) still. T_camera_imu (4, 4): what E(0) strays from. twists (K, 6): of the IMU at the
+    stamps of the poses, or None where the poses are those of the camera. knots (K,): the front end's state at each
+    stamp.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -233,12 +234,18 @@ def _repaired(
 
 def _pairs_only(steps: Sequence[PairEstimate], start: Trajectory) -> Problem:
     """The poses of the camera, the first one fixed."""
+    graph, values = _poses(start.poses.as_matrix())
+    return Problem(graph, values, start.stamps_ns, np.eye(4), None, _knots(start.stamps_ns))
+
+
+def _poses(poses: FloatArray) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Variables X at poses (K, 4, 4), and a graph that holds the first one still."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
-    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
-    for k, pose in enumerate(start.poses.as_matrix()):
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(poses[0]), fixed))
+    for k, pose in enumerate(poses):
         values.insert(X(k), gtsam.Pose3(pose))
-    return Problem(graph, values, start.stamps_ns, np.eye(4), None, _knots(start.stamps_ns))
+    return graph, values
 
 
 def _with_imu(
@@ -248,16 +255,15 @@ def _with_imu(
     calibration: ImuCalibration,
     config: PoseGraphConfig,
 ) -> Problem:
-    """The poses of the IMU, tied to the first camera; its velocities, biases, gravity and mounting; its factors."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    """The poses of the IMU, its velocities, biases, gravity and mounting; its factors."""
     T_camera_imu = np.eye(4)
     T_camera_imu[:3, :3] = calibration.mounting.inv().as_matrix()
     poses = start.poses.as_matrix() @ T_camera_imu
+    graph, values = _poses(poses)
     seconds = start.stamps_ns / NANOSECONDS
     velocities = np.gradient(poses[:, :3, 3], seconds, axis=0)
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), calibration.gyro_bias)
-    for k, (pose, velocity) in enumerate(zip(poses, velocities, strict=True)):
-        values.insert(X(k), gtsam.Pose3(pose))
+    for k, velocity in enumerate(velocities):
         values.insert(V(k), velocity)
     knots = _knots(start.stamps_ns)
     for j in range(knots[-1] + 1):
@@ -287,9 +293,7 @@ def _with_imu(
     middle = (seconds[:-1] + seconds[1:])[rates[:, 0].astype(int)] / 2
     twists[:, :3] = np.stack([np.interp(seconds, middle, axis) for axis in rates[:, 1:].T], axis=1)
     twists[:, 3:] = np.einsum("nji,nj->ni", poses[:, :3, :3], velocities)
-    problem = Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
-    problem.add(WorldFactor(T_camera_imu, twists[:1], FIRST_POSE_SIGMA))
-    return problem
+    return Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
 
 
 def _add_bias_walk(
@@ -422,8 +426,6 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
     gates = [chi2.isf(config.gate_probability, batch.dimension) for batch in judged]
     order = elimination_order(problem)
     values, width = problem.values, np.inf
-    positions = cameras(problem, values)[0][:, :3, 3]
-    still = max(CONVERGED, CONVERGED_SHARE * float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()))
     for iteration in range(MAX_ITERATIONS):
         for batch in problem.batches:
             batch.update(values)
@@ -432,13 +434,14 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
         if iteration >= FORGIVING_ITERATIONS:
             width = _reweigh(judged, gates, width, config.robust)
         linear = problem.graph.linearize(values)
-        values = values.retract(_eliminated(linear.eliminateMultifrontal, order, problem.tied_up).optimize())
-        before, positions = positions, cameras(problem, values)[0][:, :3, 3]
-        moved = np.sqrt(np.mean(np.sum((positions - before) ** 2, axis=1)))
-        if iteration >= FORGIVING_ITERATIONS and width <= 1.0 and moved < still:
+        step = _eliminated(linear.eliminateMultifrontal, order, problem.tied_up).optimize()
+        lowered = 2.0 * (linear.error(values.zeroVectors()) - linear.error(step))
+        values = values.retract(step)
+        if iteration >= FORGIVING_ITERATIONS and width <= 1.0 and lowered < CONVERGED:
             break
     if not np.all(np.isfinite(poses_of(values))):
         raise RuntimeError("the solution is not finite")
+    _make_first_camera_the_world(problem, values)
     for batch in problem.batches:
         batch.update(values)
     net = _eliminated(problem.graph.linearize(values).eliminateSequential, order, problem.tied_up)
@@ -450,6 +453,23 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
         return [key, *mounted] if kind in "xl" else [key] if kind in "bseu" else None
 
     return Solution(values, marginals.covariances(net, wanted))
+
+
+def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> None:
+    """Move the world, which changes no error, and let X(0) depend on E(0) as the first camera does not."""
+    if problem.twists is None:
+        return  # it is so already
+    moved = inverse(cameras(problem, values)[0][0])
+    poses, velocities = moved @ poses_of(values), gtsam.utilities.extractVectors(values, "v") @ moved[:3, :3].T
+    for k, (pose, velocity) in enumerate(zip(poses, velocities, strict=True)):
+        values.update(X(k), gtsam.Pose3(pose))
+        values.update(V(k), velocity)
+    values.update(G(0), gtsam.Unit3(moved[:3, :3] @ values.atUnit3(G(0)).point3()))
+    if values.exists(U(0)):
+        values.update(U(0), gtsam.Pose3(values.atPose3(U(0)).matrix() @ inverse(moved)))
+    world = WorldFactor(problem.T_camera_imu, problem.twists[:1], FIRST_POSE_SIGMA)
+    problem.batches.append(world)
+    problem.graph.replace(0, world.factor(0))
 
 
 def _eliminated(eliminate: Callable[..., Tree], order: gtsam.Ordering, tied_up: bool) -> Tree:

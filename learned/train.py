@@ -9,6 +9,7 @@ are a function of seed and step, so the curve is the same as without it.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import os
@@ -112,6 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "is drawn twice as often as one of weight 1 (default: sim)",
     )  # fmt: skip
     parser.add_argument("--steps", type=positive_integer, help="number of optimiser steps (default: the preset's)")
+    parser.add_argument("--weights", type=Path, help="a weights file to start from (default: random weights)")
+    parser.add_argument("--learning-rate", type=positive, help="at its highest (default: the preset's)")
     parser.add_argument("--batch", type=positive_integer, help="pairs a step (default: the preset's)")
     parser.add_argument(
         "--calibration-clips",
@@ -130,14 +133,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     from dataclasses import replace
 
-    changes = {"steps": options.steps, "batch": options.batch, "calibration_clips": options.calibration_clips}
+    changes = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
+    changes["calibration_clips"] = options.calibration_clips
     changes["refined_calibration_clips"] = options.calibration_clips
     recipe = replace(RECIPES[options.preset], **{name: value for name, value in changes.items() if value})
 
     def job() -> int:
         train(
             options.preset, recipe, options.out, options.seed, options.workers, options.threads, options.device,
-            options.data or (Source(),), options.precision,
+            options.data or (Source(),), options.precision, options.weights,
         )  # fmt: skip
         return EXIT_OK
 
@@ -154,11 +158,13 @@ def train(
     device: str = "auto",
     data: Sequence[Source] = (Source(),),
     precision: str = "auto",
+    start: Path | None = None,
 ) -> Path:
     """Gather pairs, train, calibrate; returns the path of the weights.
 
-    Raises UsageError where `out` was begun with other settings, LogError for a log that cannot be trained on,
-    KeyboardInterrupt where the user stops it.
+    start: weights to begin with, None for random ones. Raises UsageError where `out` was begun with other settings,
+    LogError for a log that cannot be trained on or weights that do not fit the preset, KeyboardInterrupt where the
+    user stops it.
     """
     from contextlib import nullcontext
     from functools import partial
@@ -176,13 +182,17 @@ def train(
         torch.set_num_threads(threads)
     if sum(source.log is None for source in data) > 1:
         raise UsageError("the simulator can be a source only once")
-    begin(out, preset, recipe, seed, data, precision, asdict(PRESETS[preset]))
     torch.manual_seed(seed)
-    model = VIOLearner(PRESETS[preset]).to(device)
+    model = VIOLearner(PRESETS[preset])
+    if start is not None:
+        begin_with(model, start)
+    begin(out, preset, recipe, seed, data, precision, start, asdict(PRESETS[preset]))
+    model.to(device)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     training, validation = gather(data, model, recipe, out / "data", seed, workers)
-    standardise_imu(model, training)
+    if start is None:
+        standardise_imu(model, training)
     with bfloat16_layers(model, device) if precision == "bf16" else nullcontext():
         optimise(
             model, recipe.descent(), recipe.validate_every, training, validation, out, seed, device,
@@ -199,12 +209,30 @@ def train(
     return path
 
 
+def begin_with(model: VIOLearner, start: Path) -> None:
+    """Give the network the weights of a file, its IMU statistics included. Raises LogError where they do not fit."""
+    from learned import weights
+
+    try:
+        model.load_state_dict(weights.load(start).model.state_dict())
+    except RuntimeError:  # torch's message lists every tensor
+        raise LogError(f"{start}: weights of a network of another shape than the preset's") from None
+
+
 def begin(
-    out: Path, preset: str, recipe: Recipe, seed: int, data: Sequence[Source], precision: str, network: dict[str, Any]
+    out: Path,
+    preset: str,
+    recipe: Recipe,
+    seed: int,
+    data: Sequence[Source],
+    precision: str,
+    start: Path | None,
+    network: dict[str, Any],
 ) -> None:
     """Note in run.json what a folder is begun with, or raise UsageError if it was begun with something else."""
     run = {
         "preset": preset, "seed": seed, "precision": precision, "data": [source.identity() for source in data],
+        "weights": None if start is None else hashlib.sha256(start.read_bytes()).hexdigest(),
         "recipe": asdict(recipe), "network": network,
     }  # fmt: skip
     text = json.dumps(run, indent=2) + "\n"
@@ -333,6 +361,17 @@ def _source(text: str) -> Source:
     if kind != "sim":
         return Source(Path(name), weight=weight)
     return Source(clips=positive_integer(clips) if colon else None, weight=weight)
+
+
+def positive(text: str) -> float:
+    """A positive number on the command line."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
 
 
 def positive_integer(text: str) -> int:

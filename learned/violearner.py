@@ -22,6 +22,9 @@ network on simulated streets.
   after 600 steps the translation error was 0.22 m where it was 0.36 m with one. `paper` has that of its error.
 * geometry: the step that lowers the error depends on depth and camera, which d e / d grid does not show. `fast` reads
   each pixel's ray and inverse depth beside the Jacobian, so that one network serves cameras of 60 to 110 degrees.
+* passes: a level is a learned step of descent, and may be taken more than once. Taken twice, untrained for it, levels
+  1 to 4 of a network trained for one brought the median error of simulated pairs from 27 to 18 mm and 1.7 to 1.2 mrad.
+  `fast` is trained with two; `paper` has one.
 * lost_error: pixels that leave the image cost a constant, else a network learns to look away.
 * hypotheses: how much they share is not said. Both presets share the three large layers and separate the rest.
 * relaxed winner-take-all: losers get a small share of the gradient (`loser_share`), or hypotheses die;
@@ -40,6 +43,7 @@ network on simulated streets.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
@@ -47,7 +51,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from learned.warp import NEAREST_DEPTH_M, PhotometricError, photometric_error, rotation_matrix
+from learned.warp import NEAREST_DEPTH_M, PhotometricError, chosen, photometric_error, rotation_matrix
 
 SCALES = (8, 4, 2, 1, 1)
 """Downsampling of the images at levels 0 to 4 (paper, section "Multi-Scale Projections")."""
@@ -80,13 +84,14 @@ class NetworkConfig:
     jacobian_gain: float = 2.0
     jacobian_widths: tuple[float, ...] = (0.05, 2.0)
     geometry: bool = True
+    passes: int = 1
     lost_error: float = 2.0
     loser_share: float = 0.1
     motion_scale: tuple[float, float, float, float, float, float] = (0.01, 0.01, 0.01, 0.05, 0.05, 0.5)
 
 
 PRESETS: dict[str, NetworkConfig] = {
-    "fast": NetworkConfig(),
+    "fast": NetworkConfig(passes=2),
     "paper": NetworkConfig(
         height=128,
         width=480,
@@ -151,6 +156,18 @@ class View:
     reference: Tensor
     depth: Tensor
     K: Tensor
+
+    @cached_property
+    def geometry(self) -> Tensor:
+        """Where the pixels lie, (B, 3, H, W) of about unit size: ray x/z and y/z, and 1/z (0 if unknown)."""
+        height, width = self.depth.shape[-2:]
+        K, x, y = self.K[:, :, :, None, None], torch.arange(width), torch.arange(height)
+        ray_x = (x.to(K) - K[:, 0, 2]) / K[:, 0, 0]
+        ray_y = (y.to(K)[:, None] - K[:, 1, 2]) / K[:, 1, 1]
+        known = self.depth > 0
+        inverse = torch.where(known, 1 / self.depth.clamp(min=NEAREST_DEPTH_M), torch.zeros_like(self.depth))
+        rows = [ray_x.expand(-1, height, -1), ray_y.expand(-1, -1, width), inverse]
+        return torch.stack([gain * row for gain, row in zip(GEOMETRY_GAINS, rows, strict=True)], dim=1)
 
 
 def conv(inputs: int, outputs: int, kernel: int | tuple[int, int], stride: int) -> nn.Sequential:
@@ -235,22 +252,25 @@ class VIOLearner(nn.Module):
         outcome = self.compare(views[0], pose)
         poses, errors = [pose], [outcome.error]
         for level in (1, 2, 3):
-            features = self.trunks[level - 1](self.trunk_input(outcome, views[level - 1]))
-            pose = pose + self.refinements[level - 1](features) * self.motion_scale
-            outcome = self.compare(views[level], pose)
+            for remaining in reversed(range(self.config.passes)):
+                features = self.trunks[level - 1](self.trunk_input(outcome, views[level - 1]))
+                pose = pose + self.refinements[level - 1](features) * self.motion_scale
+                outcome = self.compare(views[level - 1 if remaining else level], pose)
             poses.append(pose)
             errors.append(outcome.error)
 
-        features = self.trunks[3](self.trunk_input(outcome, views[3]))
-        hypotheses = torch.stack([pose + pathway(features) * self.motion_scale for pathway in self.hypotheses], dim=1)
-        outcomes = [self.compare(views[4], hypothesis) for hypothesis in hypotheses.unbind(1)]
-        hypothesis_errors = torch.stack([o.error for o in outcomes], dim=1)
-        winner = hypothesis_errors.detach().argmin(1)
-        rows = torch.arange(len(batch), device=winner.device)
-        poses.append(hypotheses[rows, winner])
-        errors.append(hypothesis_errors[rows, winner])
-        warped = torch.stack([o.warped for o in outcomes], dim=1)[rows, winner]
-        return Estimate(poses, errors, hypotheses, hypothesis_errors, winner, warped)
+        rows = torch.arange(len(batch), device=pose.device)
+        for _ in range(self.config.passes):
+            features = self.trunks[3](self.trunk_input(outcome, views[3]))
+            corrections = [pathway(features) * self.motion_scale for pathway in self.hypotheses]
+            hypotheses = torch.stack([pose + correction for correction in corrections], dim=1)
+            outcomes = [self.compare(views[4], hypothesis) for hypothesis in hypotheses.unbind(1)]
+            hypothesis_errors = torch.stack([o.error for o in outcomes], dim=1)
+            winner = hypothesis_errors.detach().argmin(1)
+            pose, outcome = hypotheses[rows, winner], chosen(outcomes, winner)
+        poses.append(pose)
+        errors.append(outcome.error)
+        return Estimate(poses, errors, hypotheses, hypothesis_errors, winner, outcome.warped)
 
     def level_0(self, imu: Tensor, interval_s: Tensor) -> Tensor:
         """The motion (B, 6) that the IMU window (B, 20, 6) alone suggests; unmeasured samples read as the mean."""
@@ -269,7 +289,7 @@ class VIOLearner(nn.Module):
     def trunk_input(self, outcome: PhotometricError, view: View) -> Tensor:
         """The Jacobian (B, 2 n, H, W) at about unit size, and the geometry (B, 3, H, W) if the config asks for it."""
         jacobian = outcome.jacobian * self.config.jacobian_gain
-        return torch.cat([jacobian, geometry(view)], dim=1) if self.config.geometry else jacobian
+        return torch.cat([jacobian, view.geometry], dim=1) if self.config.geometry else jacobian
 
     def pyramid(self, batch: Batch) -> list[View]:
         """The views of the five levels."""
@@ -313,17 +333,6 @@ def pose_source_target(pose: Tensor, warp: str) -> Tensor:
     matrix = torch.eye(4, dtype=pose.dtype, device=pose.device).repeat(len(R), 1, 1)
     matrix[:, :3, :3], matrix[:, :3, 3:] = R, t
     return matrix.reshape(*pose.shape[:-1], 4, 4)
-
-
-def geometry(view: View) -> Tensor:
-    """Where the pixels of a view lie, (B, 3, H, W) of about unit size: ray x/z and y/z, and 1/z (0 if unknown)."""
-    height, width = view.depth.shape[-2:]
-    K, x, y = view.K[:, :, :, None, None], torch.arange(width), torch.arange(height)
-    ray_x = (x.to(K) - K[:, 0, 2]) / K[:, 0, 0]
-    ray_y = (y.to(K)[:, None] - K[:, 1, 2]) / K[:, 1, 1]
-    inverse = torch.where(view.depth > 0, 1 / view.depth.clamp(min=NEAREST_DEPTH_M), torch.zeros_like(view.depth))
-    rows = [ray_x.expand(-1, height, -1), ray_y.expand(-1, -1, width), inverse]
-    return torch.stack([gain * row for gain, row in zip(GEOMETRY_GAINS, rows, strict=True)], dim=1)
 
 
 def pool_image(image: Tensor, scale: int) -> Tensor:

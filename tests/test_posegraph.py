@@ -143,6 +143,28 @@ def test_exact_measurements_give_the_exact_trajectory_with_the_first_camera_as_t
     assert_allclose(result.trajectory.covariances[0], 0.0)
 
 
+def test_to_make_the_first_camera_the_world_changes_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = []
+    move = posegraph._make_first_camera_the_world
+
+    def error(problem: posegraph.Problem, values: gtsam.Values) -> float:
+        for batch in problem.batches:
+            batch.update(values)
+        return sum(problem.graph.at(i).error(values) for i in range(1, problem.graph.size()))
+
+    def watched(problem: posegraph.Problem, values: gtsam.Values) -> None:
+        errors.append(error(problem, values))
+        first = posegraph.cameras(problem, values)[0][0]
+        assert np.linalg.norm(first - np.eye(4)) > 1e-4  # or there would be nothing to move
+        move(problem, values)
+        errors.append(error(problem, values))
+        assert_allclose(posegraph.cameras(problem, values)[0][0], np.eye(4), atol=1e-12)
+
+    monkeypatch.setattr(posegraph, "_make_first_camera_the_world", watched)
+    _solve(_drive())
+    assert_allclose(errors[1], errors[0], rtol=1e-9)
+
+
 def test_covariances_are_covariances_and_grow_from_that_of_a_pair() -> None:
     covariances = _solve(_drive()).trajectory.covariances
     assert covariances is not None

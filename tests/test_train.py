@@ -10,7 +10,8 @@ import torch
 from training_samples import TINY, random_pairs
 
 from fusion_io.errors import EXIT_USAGE, LogError, UsageError
-from learned import train
+from learned import train, weights
+from learned.covariance import CovarianceModel
 from learned.dataset import PairSet
 from learned.train import RECIPES, Source
 from learned.violearner import PRESETS, VIOLearner
@@ -50,7 +51,7 @@ def test_a_source_that_makes_no_sense_is_a_usage_error(text: str, tmp_path: Path
 
 def test_the_same_command_may_go_on(tmp_path: Path) -> None:
     for _ in range(2):
-        train.begin(tmp_path / "out", "paper", RECIPES["paper"], 0, [Source(clips=4)], "float32", NETWORK)
+        train.begin(tmp_path / "out", "paper", RECIPES["paper"], 0, [Source(clips=4)], "float32", None, NETWORK)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["preset"] == "paper"
 
 
@@ -62,6 +63,7 @@ def test_the_same_command_may_go_on(tmp_path: Path) -> None:
         ({"seed": 1}, "seed 0, not 1"),
         ({"data": [Source(clips=4)]}, r"data .*not .*4"),
         ({"precision": "bf16"}, "precision"),
+        ({"start": Path(__file__)}, "weights null, not"),
         ({"network": NETWORK | {"trunk_filters": 8}}, "network.trunk_filters 32, not 8"),
     ],
 )
@@ -69,7 +71,7 @@ def test_other_settings_than_the_folder_was_begun_with_are_refused(
     tmp_path: Path, change: dict[str, object], words: str
 ) -> None:
     begun = {"preset": "fast", "recipe": RECIPES["fast"], "seed": 0, "data": [Source()], "precision": "float32"}
-    begun["network"] = NETWORK
+    begun |= {"start": None, "network": NETWORK}
     train.begin(tmp_path, **begun)
     with pytest.raises(UsageError, match=words) as error:
         train.begin(tmp_path, **(begun | change))
@@ -91,3 +93,25 @@ def test_the_imu_is_standardised_by_what_was_measured_and_left_alone_where_nothi
     assert torch.equal(model.imu_mean, before)
     train.standardise_imu(model, PairSet.of([silent, pairs]))
     np.testing.assert_allclose(model.imu_mean.numpy(), pairs.imu.reshape(-1, 6).mean(0), atol=1e-5)
+
+
+def test_a_training_begins_with_the_weights_of_a_file(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    start = VIOLearner(TINY)
+    start.imu_mean += 1.0
+    weights.save(tmp_path / "start.pt", weights.Weights(start, CovarianceModel(), CovarianceModel()), {})
+    torch.manual_seed(2)
+    model = VIOLearner(dataclasses.replace(TINY, passes=2))  # how often a level is taken changes no shape
+    train.begin_with(model, tmp_path / "start.pt")
+    for name, value in start.state_dict().items():
+        assert torch.equal(model.state_dict()[name], value)
+    with pytest.raises(LogError, match=r"start\.pt: weights of a network of another shape") as error:
+        train.begin_with(VIOLearner(dataclasses.replace(TINY, trunk_filters=9)), tmp_path / "start.pt")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "x"])
+def test_a_learning_rate_that_makes_no_sense_is_a_usage_error(text: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as error:
+        train.main(["--out", str(tmp_path), "--learning-rate", text])
+    assert error.value.code == EXIT_USAGE

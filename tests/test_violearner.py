@@ -76,6 +76,40 @@ def test_winner_has_the_lowest_error(model: VIOLearner) -> None:
     assert torch.equal(estimate.poses[-1], estimate.hypotheses[torch.arange(2), estimate.winner])
 
 
+def test_a_level_taken_twice_starts_again_from_its_own_correction(model: VIOLearner) -> None:
+    batch = random_batch(SMALL)
+    twice = VIOLearner(dataclasses.replace(SMALL, passes=2))
+    twice.load_state_dict(model.state_dict())
+    views, estimate = twice.pyramid(batch), twice(batch)
+
+    def correction(level: int, pose: torch.Tensor) -> torch.Tensor:
+        seen = twice.trunk_input(twice.compare(views[level - 1], pose), views[level - 1])
+        return twice.refinements[level - 1](twice.trunks[level - 1](seen)) * twice.motion_scale
+
+    for level in (1, 2, 3):
+        before = estimate.poses[level - 1]
+        once = before + correction(level, before)
+        torch.testing.assert_close(estimate.poses[level], once + correction(level, once))
+
+
+def test_the_last_level_taken_twice_starts_again_from_its_winner(model: VIOLearner) -> None:
+    batch = random_batch(SMALL)
+    once, views = model(batch), model.pyramid(batch)
+    twice = VIOLearner(dataclasses.replace(SMALL, passes=2))
+    twice.load_state_dict(model.state_dict())
+    for trunk, refinement in zip(twice.trunks[:3], twice.refinements, strict=True):  # levels 1 to 3 do nothing
+        for layer in (trunk, refinement):
+            torch.nn.utils.vector_to_parameters(
+                torch.zeros_like(torch.nn.utils.parameters_to_vector(layer.parameters())), layer.parameters()
+            )
+    model.load_state_dict(twice.state_dict())
+    winner = model(batch).poses[-1]
+    features = model.trunks[3](model.trunk_input(model.compare(views[3], winner), views[3]))
+    again = torch.stack([winner + h(features) * model.motion_scale for h in model.hypotheses], dim=1)
+    torch.testing.assert_close(twice(batch).hypotheses, again)
+    assert not torch.equal(once.poses[-1], winner)
+
+
 def test_hypotheses_start_different(model: VIOLearner) -> None:
     hypotheses = model(random_batch(SMALL)).hypotheses
     assert float(hypotheses.std(dim=1).min()) > 0
