@@ -1,8 +1,8 @@
 """Whether the back ends know how wrong they are: Monte Carlo over drives whose errors are drawn from their model.
 
-``python benchmarks/consistency.py [--runs 50] [--seconds 30] [--hand]`` solves drives of `benchmarks.drives` with both
-back ends, and prints normalised squared errors by degree of freedom (1 is right, more is overconfident, less timid)
-with the 95 % chi-square bounds of their mean over all runs, and the same of the filter's innovations. It asserts
+``python benchmarks/consistency.py [--runs 50] [--seconds 30] [--hand] [--skips]`` solves drives of `benchmarks.drives`
+with both back ends, and prints normalised squared errors by degree of freedom (1 is right, more is overconfident, less
+timid) with the 95 % chi-square bounds of their mean over all runs, and the same of the filter's innovations. It asserts
 nothing.
 
 Errors at one frame of different runs are independent, so that the bounds are exact but for linearisation; those of the
@@ -147,12 +147,13 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=30.0, help="length of a drive")
     parser.add_argument("--hand", action="store_true", help="in the hand of somebody who walks, instead of a car")
+    parser.add_argument("--skips", action="store_true", help="with pairs that skip a frame")
     options = parser.parse_args()
 
     found: dict[tuple[str, str], list[Square]] = defaultdict(list)
     spent_s: dict[str, float] = defaultdict(float)
     for seed in track(range(options.runs), "drives", options.runs):
-        drive = simulate(seed, options.seconds, carrier=hand if options.hand else car)
+        drive = simulate(seed, options.seconds, carrier=hand if options.hand else car, skipping=options.skips)
         estimates = {}
         for name in BACK_ENDS:
             began = time.process_time()

@@ -89,8 +89,12 @@ def simulate(
     config: PoseGraphConfig | EkfConfig = POSE_GRAPH,
     carrier: Carrier = car,
     sigma: FloatArray = PAIR_SIGMA,
+    skipping: bool = False,
 ) -> Drive:
-    """A drive with the errors that a configuration states, and pairs with white noise sigma (6,) besides."""
+    """A drive with the errors that a configuration states, and pairs with white noise sigma (6,) besides.
+
+    skipping: with pairs over two steps, too.
+    """
     rng = np.random.default_rng([seed, 1])
     frames = round(seconds * FRAMES_HZ) + 1
     stamps = np.arange(frames) * (NANOSECONDS // FRAMES_HZ)
@@ -119,10 +123,11 @@ def simulate(
         rotation_std_rad=np.full(3, 1e-9),  # estimated, not given
         time_offset_std_s=1e-9,
     )
-    pairs = _pairs(rng, truth, misalignment, front_end[1:], sigma)
+    pairs = _pairs(rng, truth, misalignment, front_end, sigma, 1)
+    skips = _pairs(rng, truth, misalignment, front_end, sigma, 2) if skipping else []
     at_frames = np.searchsorted(imu.stamps_ns, stamps)
     return Drive(
-        Measurements(pairs, imu, calibration),
+        Measurements(pairs, imu, calibration, skips=skips),
         truth,
         T_camera_imu,
         ahead_s,
@@ -181,19 +186,25 @@ def _imu(
 
 
 def _pairs(
-    rng: np.random.Generator, truth: Trajectory, misalignment: FloatArray, front_end: FloatArray, sigma: FloatArray
+    rng: np.random.Generator,
+    truth: Trajectory,
+    misalignment: FloatArray,
+    front_end: FloatArray,
+    sigma: FloatArray,
+    steps: int,
 ) -> list[PairEstimate]:
-    """Pair estimates with the errors of the front end (K - 1, 4): equation (2) of `fusion.pair_model`."""
-    motions = (truth.poses[:-1].inv() * truth.poses[1:]).as_matrix()
+    """Pair estimates over some steps with the errors of the front end (K, 4): equation (2) of `fusion.pair_model`."""
+    motions = (truth.poses[:-steps].inv() * truth.poses[steps:]).as_matrix()
+    lasting = np.mean([front_end[1 + k : len(front_end) + 1 - steps + k] for k in range(steps)], axis=0)
     aligned = exp(misalignment)
-    motions[:, :3, :3] = aligned @ motions[:, :3, :3] @ aligned.T @ exp(front_end[:, 1:] / FRAMES_HZ)
-    motions[:, :3, 3] *= 1.0 + front_end[:, :1]
+    motions[:, :3, :3] = aligned @ motions[:, :3, :3] @ aligned.T @ exp(lasting[:, 1:] * steps / FRAMES_HZ)
+    motions[:, :3, 3] *= 1.0 + lasting[:, :1]
     shown = RigidTransform.from_matrix(motions) * RigidTransform.from_exp_coords(
         rng.normal(size=(len(motions), 6)) * sigma
     )
     quats_wxyz, translations = shown.rotation.as_quat(scalar_first=True), shown.translation
     stamps = truth.stamps_ns.tolist()
     return [
-        PairEstimate(stamps[k], stamps[k + 1], quats_wxyz[k], translations[k], np.diag(sigma**2))
+        PairEstimate(stamps[k], stamps[k + steps], quats_wxyz[k], translations[k], np.diag(sigma**2))
         for k in range(len(motions))
     ]

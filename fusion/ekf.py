@@ -1,13 +1,14 @@
-"""The filter back end: an error-state Kalman filter on the manifold, with a clone of the pose at the last frame.
+"""The filter back end: an error-state Kalman filter on the manifold, with clones of the poses at the last two frames.
 
 The nominal state lives outside the filter, which estimates its error (filterpy): the IMU moves the nominal state and
-spreads the error; a pair estimate measures the motion from the cloned pose to the present one; the estimated error is
-moved into the nominal state; then the present pose becomes the clone. Everything is causal. Loops move the trajectory
+spreads the error; a pair estimate measures the motion from the last frame's pose to the present one, and one that skips
+a frame that from the frame before; the estimated error is moved into the nominal state; then the present pose becomes
+the first of the clones. Everything is causal. Loops move the trajectory
 through the map of keyframes of `fusion.drift`, and leave the filter alone. Satellite positions are the pose graph's.
 
-Error state (37): attitude, position, velocity (in the IMU's axes), gyro bias, accelerometer bias, direction of gravity
+Error state (43): attitude, position, velocity (in the IMU's axes), gyro bias, accelerometer bias, direction of gravity
 (2), scale error and rate bias of the front end (4), mounting, lever arm, time offset and misalignment (10), attitude
-and position of the clone. They are those of the pose graph; what a pair shows of them is in `fusion.pair_model`. Poses
+and position of the clones. They are those of the pose graph; what a pair shows of them is in `fusion.pair_model`. Poses
 are those of the IMU, attitudes err on the right, R = R_nominal Exp(error); all else adds. Gravity is Q e3 times its
 magnitude, so that only two errors of the rotation Q are felt. The world is the first camera's frame. Without an IMU its
 axes are the camera's.
@@ -18,10 +19,11 @@ Kalman filter based visual-inertial odometry using direct photometric feedback",
 
 What a filter learns late, of scale or gravity, moves its position by what it got wrong all the way before. A trajectory
 whose past stays where it was must not jump by that: its positions are the sum of the motions as they were known when
-they happened (the trail), and the covariance of that sum is carried along exactly, as that of a state which no update
-moves; so is that of the camera's pose at the last keyframe (Schmidt, "Application of state-space methods to navigation
-problems", 1966). The turn of the world where nothing measured the motion, and the direction was lost, is such a state,
-too; to first order, so that positions far from there err along the line to it by more than is said.
+they happened, or a frame later (the trail), and the covariance of that sum is carried along exactly, as that of a state
+which no update moves; so is that of the camera's pose at the last keyframe (Schmidt, "Application of state-space
+methods to navigation problems", 1966). The turn of the world where nothing measured the motion, and the direction was
+lost, is such a state, too; to first order, so that positions far from there err along the line to it by more than is
+said.
 
 For the same reason the scale error of the front end is only considered: it widens the covariance, and accelerations do
 not estimate it. What they tell of it within seconds is little beside gravity and their own bias.
@@ -32,6 +34,7 @@ Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (error sta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import NamedTuple
@@ -43,7 +46,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
+from fusion.chain import ImuWindow, ImuWindows, stamps_of
 from fusion.config import EkfConfig
 from fusion.drift import Closures, Odometry, Pose
 from fusion.imu import ImuCalibration
@@ -51,6 +54,7 @@ from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.pair_model import Prediction, adjoint, camera, difference, exp, inverse, predict, right_jacobian, skew
 from fusion.standstill import STILL_SIGMA, standing_still
 from fusion_io.records import EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
+from fusion_io.words import counted
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
 
@@ -66,11 +70,12 @@ GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), 
 FRONT_END, SCALE = slice(17, 21), 17  # scale error, rate bias
 MOUNTING, LEVER_ARM, TIME_OFFSET, MISALIGNMENT = slice(21, 24), slice(24, 27), slice(27, 28), slice(28, 31)
 EXTRINSICS, MOUNTED = slice(21, 28), slice(21, 31)
-CLONE_ATTITUDE, CLONE_POSITION = slice(31, 34), slice(34, 37)
-DIMENSION = 37
+CLONE_ATTITUDE = slice(31, 34), slice(37, 40)  # at the last frame, and at the one before
+CLONE_POSITION = slice(34, 37), slice(40, 43)
+DIMENSION = 43
 
-# Where the errors of the past stand: of the IMU's position on the trail, of the camera's pose at the last keyframe, and
-# how the world has turned where the direction was lost.
+# Where the errors of the past stand: of the IMU's position on the trail at the frame before the last one, of the
+# camera's pose at the last keyframe, and how the world has turned where the direction was lost.
 TRAIL, KEYFRAME, TURN = slice(0, 3), slice(3, 9), slice(9, 12)
 PAST = 12
 
@@ -79,11 +84,15 @@ TILT = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
 
 
 class Measurement(NamedTuple):
-    """A pair estimate: motion (4, 4), T_source_target, its covariance (6, 6), and the time it took in seconds."""
+    """A pair estimate: motion (4, 4), T_source_target, its covariance (6, 6), and the time it took in seconds.
+
+    since: which of the clones it begins at.
+    """
 
     motion: FloatArray
     covariance: FloatArray
     seconds: float
+    since: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +102,8 @@ class State:
     R (3, 3), p (3,): pose of the IMU in the world; v (3,) m/s, rate (3,) rad/s: its velocity, and that of its turning,
     in its own axes; gyro_bias (rad/s), accelerometer_bias (m/s^2) (3,) in them, too; Q (3, 3), whose third column
     points down; front_end (4,): scale error and rate bias (rad/s); T_camera_imu (4, 4); ahead_s: how much further ahead
-    the IMU's clock is than was thought; misalignment (3,) rad; clone (4, 4), clone_twist (6,): pose and twist of the
-    IMU at the last frame.
+    the IMU's clock is than was thought; misalignment (3,) rad; clones (2, 4, 4), clone_twists (2, 6): pose and twist of
+    the IMU at the last frame and at the one before.
     """
 
     R: FloatArray
@@ -108,8 +117,8 @@ class State:
     T_camera_imu: FloatArray
     ahead_s: float
     misalignment: FloatArray
-    clone: FloatArray
-    clone_twist: FloatArray
+    clones: FloatArray
+    clone_twists: FloatArray
 
     @property
     def gravity(self) -> FloatArray:
@@ -126,17 +135,17 @@ class State:
         """(6,) of the IMU in its own axes, rotation first."""
         return np.concatenate([self.rate, self.v])
 
-    def shown(self, seconds: float) -> Prediction:
-        """What a pair estimate from the clone to now would show."""
+    def shown(self, measured: Measurement) -> Prediction:
+        """What a pair estimate would show."""
         return predict(
-            self.clone[None],
+            self.clones[measured.since, None],
             self.pose[None],
             self.T_camera_imu,
-            (self.clone_twist[None], self.twist[None]),
+            (self.clone_twists[measured.since, None], self.twist[None]),
             self.ahead_s,
             self.misalignment,
             self.front_end[None],
-            np.array([seconds]),
+            np.array([measured.seconds]),
         )
 
 
@@ -153,10 +162,10 @@ def log(matrix: FloatArray) -> FloatArray:
 
 
 def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray, FloatArray]:
-    """The state after M pieces of IMU, the Jacobians (M, 37, 37) of its error from piece to piece, and by noise.
+    """The state after M pieces of IMU, the Jacobians (M, 43, 43) of its error from piece to piece, and by noise.
 
     Rate and acceleration are constant over a piece; the acceleration acts with the attitude halfway through it. The
-    noise of a piece, whose Jacobian (M, 37, 37) is the other, is that of `Filter._spread`.
+    noise of a piece, whose Jacobian (M, 43, 43) is the other, is that of `Filter._spread`.
     """
     dt = window.durations[:, None]
     turns = (window.angular_velocity - state.gyro_bias) * dt
@@ -193,13 +202,13 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray, Float
     return replace(state, R=R[-1], p=p, v=v[-1], rate=rate), F, by_noise
 
 
-def shown_jacobian(state: State, shown: Prediction) -> FloatArray:
-    """H (6, 37): how what a pair estimate shows changes with the error, as a right perturbation."""
+def shown_jacobian(state: State, shown: Prediction, since: int) -> FloatArray:
+    """H (6, 43): how what a pair estimate since one of the clones shows changes with the error, on the right."""
     H = np.zeros((6, DIMENSION))
     H[:, ATTITUDE] = shown.by_target[0, :, :3]
     H[:, POSITION] = shown.by_target[0, :, 3:] @ state.R.T
-    H[:, CLONE_ATTITUDE] = shown.by_source[0, :, :3]
-    H[:, CLONE_POSITION] = shown.by_source[0, :, 3:] @ state.clone[:3, :3].T
+    H[:, CLONE_ATTITUDE[since]] = shown.by_source[0, :, :3]
+    H[:, CLONE_POSITION[since]] = shown.by_source[0, :, 3:] @ state.clones[since, :3, :3].T
     H[:, FRONT_END] = shown.by_front_end[0]
     H[:, EXTRINSICS] = shown.by_extrinsics[0]
     H[:, MISALIGNMENT] = shown.by_misalignment[0]
@@ -207,7 +216,11 @@ def shown_jacobian(state: State, shown: Prediction) -> FloatArray:
 
 
 def inject(state: State, error: FloatArray) -> State:
-    """The state with an error (37,) moved into it."""
+    """The state with an error (43,) moved into it."""
+    clones = [
+        pose(clone[:3, :3] @ exp(error[attitude]), clone[:3, 3] + error[position])
+        for clone, attitude, position in zip(state.clones, CLONE_ATTITUDE, CLONE_POSITION, strict=True)
+    ]
     return replace(
         state,
         R=state.R @ exp(error[ATTITUDE]),
@@ -220,7 +233,7 @@ def inject(state: State, error: FloatArray) -> State:
         T_camera_imu=state.T_camera_imu @ pose(exp(error[MOUNTING]), error[LEVER_ARM]),
         ahead_s=state.ahead_s + float(error[TIME_OFFSET][0]),
         misalignment=state.misalignment + error[MISALIGNMENT],
-        clone=pose(state.clone[:3, :3] @ exp(error[CLONE_ATTITUDE]), state.clone[:3, 3] + error[CLONE_POSITION]),
+        clones=np.stack(clones),
     )
 
 
@@ -230,11 +243,13 @@ def turning_sigma(covariance: FloatArray) -> float:
 
 
 def reset_jacobian(error: FloatArray) -> FloatArray:
-    """(37, 37): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
+    """(43, 43): what is left of an error about a state into which `error` was moved (Sola, section 6.3)."""
     G = np.eye(DIMENSION)
-    turns = [error[ATTITUDE], np.append(error[GRAVITY_DIRECTION], 0.0), error[CLONE_ATTITUDE], error[MOUNTING]]
-    attitude, of_gravity, clone, mounting = right_jacobian(np.stack(turns))
-    G[ATTITUDE, ATTITUDE], G[CLONE_ATTITUDE, CLONE_ATTITUDE], G[MOUNTING, MOUNTING] = attitude, clone, mounting
+    turned = (ATTITUDE, *CLONE_ATTITUDE, MOUNTING)
+    turns = [*(error[part] for part in turned), np.append(error[GRAVITY_DIRECTION], 0.0)]
+    *left, of_gravity = right_jacobian(np.stack(turns))
+    for part, matrix in zip(turned, left, strict=True):
+        G[part, part] = matrix
     G[GRAVITY_DIRECTION, GRAVITY_DIRECTION] = of_gravity[:2, :2]
     G[LEVER_ARM, LEVER_ARM] = exp(error[MOUNTING]).T  # it moves along axes that have turned
     return G
@@ -296,8 +311,8 @@ class Filter:
             T_camera_imu,
             ahead_s,
             misalignment,
-            first,
-            twist,
+            np.stack([first, first]),
+            np.stack([twist, twist]),
         )
         self.knows_gravity = False
         self.kf = ExtendedKalmanFilter(dim_x=DIMENSION, dim_z=6)
@@ -305,10 +320,11 @@ class Filter:
         # The first camera is the world itself, so that the IMU's first pose errs as its mounting and its clock do.
         by_extrinsics = np.column_stack([adjoint(moved), -twist])
         tie = np.eye(DIMENSION)
-        tie[ATTITUDE, EXTRINSICS] = tie[CLONE_ATTITUDE, EXTRINSICS] = by_extrinsics[:3]
-        tie[POSITION, EXTRINSICS] = tie[CLONE_POSITION, EXTRINSICS] = R @ by_extrinsics[3:]
+        for attitude, position in zip((ATTITUDE, *CLONE_ATTITUDE), (POSITION, *CLONE_POSITION), strict=True):
+            tie[attitude, EXTRINSICS] = by_extrinsics[:3]
+            tie[position, EXTRINSICS] = R @ by_extrinsics[3:]
         self.kf.P = tie @ P @ tie.T
-        self.trail = p  # of the IMU
+        self.trail = p  # of the IMU, at the frame before the last one
         self.lost_at = p
         self.past_covariance = np.zeros((PAST, PAST))  # of what no update moves
         self.past_covariance[TRAIL, TRAIL] = self.kf.P[POSITION, POSITION]
@@ -329,15 +345,15 @@ class Filter:
 
     def squared_innovation(self, measured: Measurement) -> tuple[FloatArray, float]:
         """The innovation (6,), rotation first, and its squared Mahalanobis norm: chi-square of 6 degrees of freedom."""
-        shown = self.state.shown(measured.seconds)
-        H = shown_jacobian(self.state, shown)
+        shown = self.state.shown(measured)
+        H = shown_jacobian(self.state, shown, measured.since)
         innovation = difference(shown.motion, measured.motion[None])[0]
         return innovation, float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + measured.covariance, innovation))
 
     def update(self, measured: Measurement) -> None:
-        """Correct by a measurement since the clone (Joseph form), move the error into the state and reset it."""
-        shown = self.state.shown(measured.seconds)
-        H = shown_jacobian(self.state, shown)
+        """Correct by a measurement since a clone (Joseph form), move the error into the state and reset it."""
+        shown = self.state.shown(measured)
+        H = shown_jacobian(self.state, shown, measured.since)
         before = self.kf.P
         self.kf.update(
             measured.motion,
@@ -348,6 +364,13 @@ class Filter:
         )
         self._consider(before, H, measured.covariance)
         self._move_error(H)
+
+    def update_unless_outlier(self, measured: Measurement, gate: float) -> bool:
+        """Correct by a measurement whose squared innovation is within a gate; returns whether it is."""
+        if self.squared_innovation(measured)[1] > gate:
+            return False
+        self.update(measured)
+        return True
 
     def stand_still(self) -> None:
         """Correct by the knowledge that the IMU does not move (zero-velocity update)."""
@@ -373,7 +396,7 @@ class Filter:
         self.kf.P = keep @ before @ keep.T + gain @ R @ gain.T
 
     def _move_error(self, H: FloatArray) -> None:
-        """After an update by H (M, 37): move the error into the state, and reset it."""
+        """After an update by H (M, 43): move the error into the state, and reset it."""
         G = reset_jacobian(self.kf.x)
         self.past_cross = self.past_cross @ (np.eye(DIMENSION) - self.kf.K @ H).T @ G.T
         P = G @ self.kf.P @ G.T
@@ -382,21 +405,27 @@ class Filter:
         self.kf.x = np.zeros(DIMENSION)
 
     def clone(self) -> None:
-        """Add the motion since the clone to the trail, and make the present pose the clone; it errs as that does."""
-        self.trail = self.trail + self.state.p - self.state.clone[:3, 3]
-        added = self.kf.P[POSITION] - self.kf.P[CLONE_POSITION]
-        cross = self.past_cross[:, POSITION] - self.past_cross[:, CLONE_POSITION]
+        """Make the present pose the first of the clones, and let the trail go on to the one that it was."""
+        first, second = CLONE_POSITION
+        self.trail = self.trail + self.state.clones[0, :3, 3] - self.state.clones[1, :3, 3]
+        added = self.kf.P[first] - self.kf.P[second]
+        cross = self.past_cross[:, first] - self.past_cross[:, second]
         covariance = self.past_covariance.copy()
         covariance[:, TRAIL] += cross
         covariance[TRAIL] += cross.T
-        covariance[TRAIL, TRAIL] += added[:, POSITION] - added[:, CLONE_POSITION]
+        covariance[TRAIL, TRAIL] += added[:, first] - added[:, second]
         self.past_covariance = covariance
         self.past_cross = self.past_cross.copy()
         self.past_cross[TRAIL] += added
-        self.state = replace(self.state, clone=self.state.pose, clone_twist=self.state.twist)
-        copy = np.eye(DIMENSION)
-        copy[CLONE_ATTITUDE] = copy[ATTITUDE]
-        copy[CLONE_POSITION] = copy[POSITION]
+        state = self.state
+        self.state = replace(
+            state,
+            clones=np.stack([state.pose, state.clones[0]]),
+            clone_twists=np.stack([state.twist, state.clone_twists[0]]),
+        )
+        copy, same = np.eye(DIMENSION), np.eye(DIMENSION)
+        for (new, old), present in zip((CLONE_ATTITUDE, CLONE_POSITION), (ATTITUDE, POSITION), strict=True):
+            copy[new], copy[old] = same[present], same[new]
         self.kf.P = copy @ self.kf.P @ copy.T
         self.past_cross = self.past_cross @ copy.T
 
@@ -407,7 +436,7 @@ class Filter:
         world turns about the last position that was measured by one unknown rotation, which no measurement feels. It
         widens the covariances of the poses that follow. Gravity is looked for anew.
         """
-        state, to_imu = self.state, self.state.T_camera_imu
+        state, to_imu, here = self.state, self.state.T_camera_imu, self.on_trail
         moved = inverse(to_imu) @ measured.motion @ to_imu
         F, by_noise, variances = np.eye(DIMENSION), np.eye(DIMENSION), np.zeros(DIMENSION)
         F[ATTITUDE, ATTITUDE] = moved[:3, :3].T
@@ -419,11 +448,11 @@ class Filter:
         self.knows_gravity = False
         # What an earlier loss did to the position until here stays with it; from here on the turns are one.
         settled = np.eye(PAST)
-        settled[TRAIL, TURN] = -skew(self.trail - self.lost_at)
+        settled[TRAIL, TURN] = -skew(here - self.lost_at)
         self.past_covariance = settled @ self.past_covariance @ settled.T
         self.past_covariance[TURN, TURN] += min(turning_sigma(measured.covariance), UNKNOWN_TURN) ** 2 * np.eye(3)
         self.past_cross = settled @ self.past_cross
-        self.lost_at = self.trail
+        self.lost_at = here
 
     def forget_velocity(self) -> None:
         """Make the velocity as uncertain as at first, and independent of all else."""
@@ -432,9 +461,10 @@ class Filter:
     def take_twist(self, measured: Measurement) -> None:
         """Where no IMU measures it, rate and velocity are those of the step that was measured just now."""
         seconds = measured.seconds
-        turned = log(self.state.clone[:3, :3].T @ self.state.R)
+        last = self.state.clones[0]
+        turned = log(last[:3, :3].T @ self.state.R)
         halfway = self.state.R @ exp(-turned / 2)  # a mean velocity is that of the middle
-        velocity = halfway.T @ (self.state.p - self.state.clone[:3, 3]) / seconds
+        velocity = halfway.T @ (self.state.p - last[:3, 3]) / seconds
         self.state = replace(self.state, rate=turned / seconds, v=velocity)
         variance = measured.covariance[3:, 3:].trace() / 3 / seconds**2 + self.unknown[1] ** 2 * seconds
         self._renew_velocity(variance)
@@ -470,20 +500,26 @@ class Filter:
         cross[KEYFRAME] = with_state
         self.past_covariance, self.past_cross = covariance, cross
 
+    @property
+    def on_trail(self) -> FloatArray:
+        """The present position (3,) of the IMU on the trail."""
+        return self.trail + self.state.p - self.state.clones[1, :3, 3]
+
     def _camera(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The camera's pose (4, 4) on the trail, and how it changes with the state (6, 37) and the past (6, 12)."""
-        state = self.state
-        on_trail = pose(state.R, self.trail)[None]
+        """The camera's pose (4, 4) on the trail, and how it changes with the state (6, 43) and the past (6, 12)."""
+        state, here = self.state, self.on_trail
+        on_trail = pose(state.R, here)[None]
         cameras, by_pose, by_extrinsics = camera(on_trail, state.T_camera_imu, state.twist[None], state.ahead_s)
         by_state, by_past = np.zeros((6, DIMENSION)), np.zeros((6, PAST))
         by_state[:, ATTITUDE] = by_pose[0, :, :3]
         by_state[:, EXTRINSICS] = by_extrinsics[0]
         by_past[:, TRAIL] = by_pose[0, :, 3:] @ state.R.T
-        by_past[:, TURN] = by_pose[0, :, :3] @ state.R.T - by_past[:, TRAIL] @ skew(self.trail - self.lost_at)
+        by_state[:, POSITION], by_state[:, CLONE_POSITION[1]] = by_past[:, TRAIL], -by_past[:, TRAIL]
+        by_past[:, TURN] = by_pose[0, :, :3] @ state.R.T - by_past[:, TRAIL] @ skew(here - self.lost_at)
         return cameras[0], by_state, by_past
 
     def _present(self, by_state: FloatArray, by_past: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The covariance (6, 6) of a pose, and that (6, 37) with the error of the state."""
+        """The covariance (6, 6) of a pose, and that (6, 43) with the error of the state."""
         crossed = by_past @ self.past_cross @ by_state.T
         of_past = by_past @ self.past_covariance @ by_past.T
         covariance = by_state @ self.kf.P @ by_state.T + crossed + crossed.T + of_past
@@ -555,10 +591,10 @@ class Filter:
         acceleration: float,
         seconds: FloatArray,
     ) -> None:
-        """Move the covariance on over M pieces that last seconds (M,), with the jacobians (M, 37, 37) of each.
+        """Move the covariance on over M pieces that last seconds (M,), with the jacobians (M, 43, 43) of each.
 
-        Noise has variances (M, 37), and that of a white acceleration of a density in m/s^2/sqrt(Hz), whose position is
-        in the axes of the IMU, too; by_noise (M, 37, 37): how the error changes with it.
+        Noise has variances (M, 43), and that of a white acceleration of a density in m/s^2/sqrt(Hz), whose position is
+        in the axes of the IMU, too; by_noise (M, 43, 43): how the error changes with it.
         """
         noise = variances[:, :, None] * np.eye(DIMENSION)
         by_axis = (acceleration**2 * seconds)[:, None, None] * np.eye(3)
@@ -578,7 +614,8 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
 
     Steps that it did not measure from start to end are predicted by constant velocity and rate; without any that it
     measured nothing is predicted, and the poses are those of the chain. Each pose is that of its own instant; what
-    loops tell of earlier ones is in `Estimate.hindsight`. Pairs that skip frames and positions are not used.
+    loops tell of earlier ones is in `Estimate.hindsight`. Of the pairs that skip frames those over two steps are used;
+    positions are not.
     """
     steps, calibration = measurements.steps, measurements.calibration
     samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
@@ -593,9 +630,10 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     closures = Closures(measurements.loops, stamps_ns, config.gate_probability)
     rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [Pose(np.eye(4), np.zeros((6, 6)))]
     in_a_row = 0
-    motions = motions_of(steps).as_matrix()
-    for frame, (step, motion, window, stands) in enumerate(zip(steps, motions, windows, still, strict=True), 1):
-        pair = Measurement(motion, step.covariance + _by_stamps(step, config.stamp_jitter_s), step.duration_s)
+    skips = _over_two_steps(measurements.skips, stamps_ns)
+    skips_rejected = 0
+    for frame, (step, window, stands) in enumerate(zip(steps, windows, still, strict=True), 1):
+        pair = _measurement(step, config)
         if calibration is not None and np.any(_during(calibration.bias_steps_ns, step)):
             ekf.doubt_gyro_bias(calibration.gyro_bias_std)
         lost = calibration is not None and window is None and turning_sigma(pair.covariance) > LOST
@@ -604,6 +642,8 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
             innovation, nis, used = np.full(6, np.nan), np.nan, True
         else:
             innovation, nis, used, in_a_row = _measure(ekf, pair, window, gate, in_a_row)
+        if (skip := skips.get(frame)) is not None and not lost:
+            skips_rejected += not ekf.update_unless_outlier(_measurement(skip, config, since=1), gate)
         if stands and used:
             ekf.stand_still()
         if window is None:
@@ -616,11 +656,11 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
 
     series = EstimatorSeries(stamps_ns, *(np.array(column) for column in zip(*rows, strict=True)))
     poses, covariances = (np.stack(column) for column in zip(*cameras, strict=True))
-    pairs_rejected = int(np.sum(~series.used))
+    pairs_rejected = int(np.sum(~series.used)) + skips_rejected
     measured = sum(window is not None for window in windows)
     return Estimate(
         Trajectory(stamps_ns, RigidTransform.from_matrix(poses), covariances),
-        _note(measured, len(steps), pairs_rejected) + closures.note,
+        _note(measured, len(steps), len(skips), pairs_rejected) + closures.note,
         pairs_rejected + int(np.sum(~closures.used)),
         series if calibration is not None else _without_biases(series),
         loops_used=closures.used,
@@ -651,6 +691,18 @@ def _measure(
         in_a_row = 0
     ekf.update(pair)
     return innovation, nis, True, in_a_row
+
+
+def _measurement(pair: PairEstimate, config: EkfConfig, since: int = 0) -> Measurement:
+    covariance = pair.covariance + _by_stamps(pair, config.stamp_jitter_s)
+    return Measurement(pair.T_source_target.as_matrix(), covariance, pair.duration_s, since)
+
+
+def _over_two_steps(skips: Sequence[PairEstimate], stamps_ns: IntArray) -> dict[int, PairEstimate]:
+    """The pairs that lead from the frame before the last one to a frame, by that frame's number."""
+    frames = {before: frame for frame, before in enumerate(stamps_ns.tolist()[:-2], 2)}
+    found = ((frames.get(skip.source_stamp_ns), skip) for skip in skips)
+    return {frame: skip for frame, skip in found if frame and stamps_ns[frame] == skip.target_stamp_ns}
 
 
 def _during(stamps_ns: IntArray, step: PairEstimate) -> NDArray[np.bool_]:
@@ -695,8 +747,9 @@ def _without_biases(series: EstimatorSeries) -> EstimatorSeries:
     )
 
 
-def _note(measured: int, steps: int, rejected: int) -> str:
-    left_out = f"; pairs rejected: {rejected}" if rejected else ""
+def _note(measured: int, steps: int, skips: int, rejected: int) -> str:
+    skipping = f"; {counted(skips, 'pair that skips a frame', 'pairs that skip a frame')}" if skips else ""
+    left_out = skipping + (f"; pairs rejected: {rejected}" if rejected else "")
     if measured == 0:
         return f"pairs only: no IMU{left_out}"
     if measured < steps:

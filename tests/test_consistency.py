@@ -65,6 +65,23 @@ def test_the_back_ends_agree_within_the_covariance_of_the_filter() -> None:
 
 
 @pytest.mark.parametrize("back_end", BACK_ENDS)
+def test_poses_err_by_what_is_said_with_pairs_that_skip_a_frame_and_by_less(back_end: str) -> None:
+    solve, config = (posegraph.solve, POSE_GRAPH) if back_end == "posegraph" else (ekf.solve, EKF)
+    found, said = defaultdict(list), []
+    for seed in range(RUNS):
+        drive = simulate(seed, SECONDS, skipping=True)
+        known = drive.measurements
+        with_skips, without = (solve(each, config).trajectory for each in (known, replace(known, skips=[])))
+        for name, square in pose_squares(with_skips, drive.truth).items():
+            found[name].append(square)
+        said.append(np.log(np.linalg.det(with_skips.covariances[-1]) / np.linalg.det(without.covariances[-1])))
+    means = {name: bounds(of_runs, PROBABILITY) for name, of_runs in found.items()}
+    outside = {name: mean for name, (mean, low, high) in means.items() if not low < mean < high}
+    assert not outside, outside
+    assert max(said) < 0.0
+
+
+@pytest.mark.parametrize("back_end", BACK_ENDS)
 @pytest.mark.parametrize("factor", [1 / 9, 9.0])
 def test_one_that_claims_a_third_or_three_times_its_errors_is_found_out(back_end: str, factor: float) -> None:
     """The bounds are not so wide that nothing could leave them."""

@@ -69,7 +69,8 @@ def _random_state(rng: np.random.Generator, ahead_s: float = 0.0) -> State:
     p, v, rate = rng.normal(size=(3, 3))
     biases, front_end = 0.1 * rng.normal(size=(2, 3)), 0.1 * rng.normal(size=4)
     extrinsics = _transform(rng), ahead_s, 0.2 * rng.normal(size=3)
-    return State(R, p, v, rate, *biases, Q, front_end, *extrinsics, _transform(rng), rng.normal(size=6))
+    clones = np.stack([_transform(rng), _transform(rng)])
+    return State(R, p, v, rate, *biases, Q, front_end, *extrinsics, clones, rng.normal(size=(2, 6)))
 
 
 def _random_window(rng: np.random.Generator, pieces: int) -> ImuWindow:
@@ -81,8 +82,9 @@ def _turned(R: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def _error(state: State, other: State) -> FloatArray:
-    """The error (37,) that takes one nominal state to another: the inverse of `inject`, written out by itself."""
-    mounted, clone = (state.T_camera_imu, other.T_camera_imu), (state.clone, other.clone)
+    """The error (43,) that takes one nominal state to another: the inverse of `inject`, written out by itself."""
+    mounted = state.T_camera_imu, other.T_camera_imu
+    clones = zip(state.clones, other.clones, strict=True)
     return np.concatenate(
         [
             _turned(state.R, other.R),
@@ -96,8 +98,7 @@ def _error(state: State, other: State) -> FloatArray:
             mounted[0][:3, :3].T @ (mounted[1][:3, 3] - mounted[0][:3, 3]),
             [other.ahead_s - state.ahead_s],
             other.misalignment - state.misalignment,
-            _turned(clone[0][:3, :3], clone[1][:3, :3]),
-            clone[1][:3, 3] - clone[0][:3, 3],
+            *(part for a, b in clones for part in (_turned(a[:3, :3], b[:3, :3]), b[:3, 3] - a[:3, 3])),
         ]
     )
 
@@ -122,25 +123,28 @@ def test_the_jacobian_of_the_prediction_equals_finite_differences(pieces: int) -
         assert_allclose(product[:, k], numeric, atol=1e-7)
 
 
+@pytest.mark.parametrize("since", [0, 1])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_jacobian_of_the_measurement_equals_finite_differences(seed: int) -> None:
+def test_the_jacobian_of_the_measurement_equals_finite_differences(seed: int, since: int) -> None:
     """At a clock that is right, and, with twists that are taken as known, at one that is not."""
     rng = np.random.default_rng(seed)
     state = _random_state(rng)
-    shown = state.shown(0.4)
-    H = shown_jacobian(state, shown)
+    pair = Measurement(np.eye(4), np.eye(6), 0.4, since)
+    shown = state.shown(pair)
+    H = shown_jacobian(state, shown, since)
     for k, direction in enumerate(STEP * np.eye(DIMENSION)):
-        ends = [inject(state, sign * direction).shown(0.4).motion for sign in (1, -1)]
+        ends = [inject(state, sign * direction).shown(pair).motion for sign in (1, -1)]
         numeric = (difference(shown.motion, ends[0]) - difference(shown.motion, ends[1]))[0] / (2 * STEP)
         assert_allclose(H[:, k], numeric, atol=1e-7 if k not in range(*ekf.TIME_OFFSET.indices(99)) else 1e-5)
 
 
 def _turn_of_the_world(state: State) -> FloatArray:
-    """(37, 3): the errors that turn everything about the axes of the world."""
+    """(43, 3): the errors that turn everything about the axes of the world."""
     errors = np.zeros((DIMENSION, 3))
     errors[ekf.ATTITUDE], errors[ekf.POSITION] = state.R.T, -ekf.skew(state.p)
     errors[ekf.GRAVITY_DIRECTION] = state.Q.T[:2]
-    errors[ekf.CLONE_ATTITUDE], errors[ekf.CLONE_POSITION] = state.clone[:3, :3].T, -ekf.skew(state.clone[:3, 3])
+    for clone, attitude, position in zip(state.clones, ekf.CLONE_ATTITUDE, ekf.CLONE_POSITION, strict=True):
+        errors[attitude], errors[position] = clone[:3, :3].T, -ekf.skew(clone[:3, 3])
     return errors
 
 
@@ -151,7 +155,9 @@ def test_no_measurement_feels_a_turn_of_the_world(velocity: float) -> None:
     state = replace(_random_state(rng), v=velocity * rng.normal(size=3))
     moved, (jacobian,), _ = propagate(state, _random_window(rng, 1))
     assert_allclose(jacobian @ _turn_of_the_world(state), _turn_of_the_world(moved), atol=1e-12)
-    assert_allclose(shown_jacobian(moved, moved.shown(0.1)) @ _turn_of_the_world(moved), 0.0, atol=1e-10)
+    for since in (0, 1):
+        shown = moved.shown(Measurement(np.eye(4), np.eye(6), 0.1, since))
+        assert_allclose(shown_jacobian(moved, shown, since) @ _turn_of_the_world(moved), 0.0, atol=1e-10)
     assert not np.any(_turn_of_the_world(state)[ekf.VELOCITY])
 
 
@@ -177,19 +183,19 @@ def _filter(mounting: Mounting | None = None) -> Filter:
 
 
 class WithTrail(Filter):
-    """A filter with the past as a state of the whole: matrices (46, 46), no shortcuts, a gain of zero for it."""
+    """A filter with the past as a state of the whole: matrices (52, 52), no shortcuts, a gain of zero for it."""
 
     def __init__(self, *arguments: object) -> None:
         super().__init__(*arguments)  # type: ignore[arg-type]
-        at_first = np.zeros((46, DIMENSION))
-        at_first[:37], at_first[37:40] = np.eye(DIMENSION), np.eye(DIMENSION)[ekf.POSITION]
+        at_first = np.zeros((52, DIMENSION))
+        at_first[:43], at_first[43:46] = np.eye(DIMENSION), np.eye(DIMENSION)[ekf.POSITION]
         self.joint = at_first @ self.kf.P @ at_first.T
         self.noise = np.zeros((0, 0))
         predict = self.kf.predict
 
         def both() -> None:
-            F, Q = np.eye(46), np.zeros((46, 46))
-            F[:37, :37], Q[:37, :37] = self.kf.F, self.kf.Q
+            F, Q = np.eye(52), np.zeros((52, 52))
+            F[:43, :43], Q[:43, :43] = self.kf.F, self.kf.Q
             self.joint = F @ self.joint @ F.T + Q
             predict()
 
@@ -205,9 +211,9 @@ class WithTrail(Filter):
 
     def _move_error(self, H: FloatArray) -> None:
         gain = np.vstack([self.kf.K, np.zeros((9, len(H)))])
-        left = np.eye(46) - gain @ np.hstack([H, np.zeros((len(H), 9))])
-        reset = np.eye(46)
-        reset[:37, :37] = reset_jacobian(self.kf.x)
+        left = np.eye(52) - gain @ np.hstack([H, np.zeros((len(H), 9))])
+        reset = np.eye(52)
+        reset[:43, :43] = reset_jacobian(self.kf.x)
         self.joint = reset @ (left @ self.joint @ left.T + gain @ self.noise @ gain.T) @ reset.T
         super()._move_error(H)
 
@@ -218,47 +224,61 @@ class WithTrail(Filter):
 
     def _look_down(self, window: ImuWindow) -> None:
         super()._look_down(window)
-        taken = np.eye(46)
+        taken = np.eye(52)
         taken[ekf.GRAVITY_DIRECTION] = 0.0
         taken[ekf.GRAVITY_DIRECTION, ekf.ATTITUDE] = (self.state.Q.T @ self.state.R)[:2]
         self.joint = taken @ self.joint @ taken.T
         self.joint[ekf.GRAVITY_DIRECTION, ekf.GRAVITY_DIRECTION] += self.config.gravity_sigma**2 * np.eye(2)
 
     def clone(self) -> None:
-        copy = np.eye(46)
-        copy[37:40, ekf.POSITION] += np.eye(3)
-        copy[37:40, ekf.CLONE_POSITION] -= np.eye(3)
-        copy[ekf.CLONE_ATTITUDE] = np.eye(46)[ekf.ATTITUDE]
-        copy[ekf.CLONE_POSITION] = np.eye(46)[ekf.POSITION]
+        copy, same = np.eye(52), np.eye(52)
+        copy[43:46] += same[ekf.CLONE_POSITION[0]] - same[ekf.CLONE_POSITION[1]]
+        for (new, old), present in (
+            (ekf.CLONE_ATTITUDE, ekf.ATTITUDE),
+            (ekf.CLONE_POSITION, ekf.POSITION),
+        ):
+            copy[new], copy[old] = same[present], same[new]
         self.joint = copy @ self.joint @ copy.T
         super().clone()
 
     def keep(self) -> None:
         _, by_state, by_past = self._camera()
-        become = np.eye(46)
-        become[40:] = np.hstack([by_state, by_past[:, :9]])
+        become = np.eye(52)
+        become[46:] = np.hstack([by_state, by_past[:, :9]])
         self.joint = become @ self.joint @ become.T
         super().keep()
 
 
 def test_the_covariance_of_the_past_is_that_of_explicit_schmidt_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of trail and keyframe, over a drive that has a hole in the IMU, a wild pair and a stand-still."""
+    """Of trail and keyframe, over a drive that has a hole in the IMU, a wild pair, a stand-still, and skips."""
     filters: list[WithTrail] = []
     monkeypatch.setattr(ekf, "Filter", lambda *arguments: filters.append(WithTrail(*arguments)) or filters[-1])
     monkeypatch.setattr(ekf, "standing_still", lambda steps, *_: np.arange(len(steps)) // 10 == 3)
     monkeypatch.setattr(ekf, "STILL_SIGMA", 10.0)  # for it does not stand
-    drive = _drive()
+    drive = simulate(0, 12.0, EKF, skipping=True)
     pairs = [_wild(pair) if k == 15 else pair for k, pair in enumerate(drive.measurements.steps[:45])]
     result = _solve(drive, pairs, _without(drive, 2.0, 2.5))
     assert result.rejected == 1
+    assert "44 pairs that skip" in result.note
     (found,) = filters
-    assert_allclose(found.kf.P, found.joint[:37, :37], rtol=1e-6, atol=1e-12)
-    assert_allclose(found.past_cross[:9], found.joint[37:, :37], rtol=1e-6, atol=1e-12)
+    assert_allclose(found.kf.P, found.joint[:43, :43], rtol=1e-6, atol=1e-12)
+    assert_allclose(found.past_cross[:9], found.joint[43:, :43], rtol=1e-6, atol=1e-12)
     assert not np.any(found.past_covariance[ekf.TURN])  # no direction was lost
-    assert_allclose(found.past_covariance[:9, :9], found.joint[37:, 37:], rtol=1e-6, atol=1e-12)
+    assert_allclose(found.past_covariance[:9, :9], found.joint[43:, 43:], rtol=1e-6, atol=1e-12)
     assert not np.allclose(
         found.past_covariance[ekf.TRAIL, ekf.TRAIL], found.kf.P[ekf.POSITION, ekf.POSITION], rtol=0.05
     )
+
+
+def test_a_wild_pair_that_skips_a_frame_is_left_out() -> None:
+    drive = simulate(0, 6.0, EKF, skipping=True)
+    known = drive.measurements
+    without = ekf.solve(replace(known, skips=[each for k, each in enumerate(known.skips) if k != 20]), EKF)
+    wild = ekf.solve(
+        replace(known, skips=[_wild(each) if k == 20 else each for k, each in enumerate(known.skips)]), EKF
+    )
+    assert (without.rejected, wild.rejected) == (0, 1)
+    assert_array_equal(wild.trajectory.poses.as_matrix(), without.trajectory.poses.as_matrix())
 
 
 def test_where_the_first_camera_is_the_world_it_is_so_for_any_mounting() -> None:
@@ -276,7 +296,7 @@ def test_where_the_first_camera_is_the_world_it_is_so_for_any_mounting() -> None
         P = filter_.kf.P
         with_it = P[:, ekf.EXTRINSICS] @ np.linalg.solve(P[ekf.EXTRINSICS, ekf.EXTRINSICS], extrinsics[ekf.EXTRINSICS])
         moved = inject(filter_.state, with_it)
-        camera, *_ = ekf.camera(moved.pose[None], moved.T_camera_imu, filter_.state.clone_twist[None], moved.ahead_s)
+        camera, *_ = ekf.camera(moved.pose[None], moved.T_camera_imu, filter_.state.clone_twists[:1], moved.ahead_s)
         assert_allclose(camera[0], np.eye(4), atol=1e-10)
 
 
@@ -285,13 +305,14 @@ def test_the_update_is_that_of_the_textbook() -> None:
     rng = np.random.default_rng(7)
     filter_ = _filter()
     filter_.kf.P = np.diag(rng.uniform(0.5, 1.0, DIMENSION)) * 1e-8
-    H = shown_jacobian(filter_.state, filter_.state.shown(0.1))
     covariance = 1e-8 * np.diag(rng.uniform(0.5, 1.0, 6))
     motion = RigidTransform.from_exp_coords(1e-4 * rng.normal(size=6)).as_matrix()
+    pair = Measurement(motion, covariance, 0.1)
+    H = shown_jacobian(filter_.state, filter_.state.shown(pair), 0)
     expected = np.linalg.inv(np.linalg.inv(filter_.kf.P) + H.T @ np.linalg.solve(covariance, H))
     moved = expected @ H.T @ np.linalg.solve(covariance, difference(np.eye(4)[None], motion[None])[0])
     before = filter_.state
-    filter_.update(Measurement(motion, covariance, 0.1))
+    filter_.update(pair)
     assert_allclose(filter_.kf.P, expected, rtol=1e-3, atol=1e-12)
     assert_allclose(_error(before, filter_.state), moved, rtol=1e-9, atol=1e-12)
 
