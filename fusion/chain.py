@@ -29,6 +29,9 @@ MAX_IMU_PERIODS = 2.5
 # So many samples that all show the same are those of a sensor that is stuck.
 MIN_REPEATS = 4
 
+# So long a carrier turns at one rate, nearly, and at one that changes evenly.
+AT_ONCE_S, EVENLY_S = 0.03, 0.1
+
 
 class ImuWindow(NamedTuple):
     """An IMU over an interval of time, in M pieces that fill it.
@@ -43,6 +46,43 @@ class ImuWindow(NamedTuple):
     def rotation(self, bias: FloatArray) -> Rotation:
         """R_start_end by the gyro, less its bias (3,) rad/s."""
         return reduce(mul, Rotation.from_rotvec((self.angular_velocity - bias) * self.durations[:, None]))
+
+    @property
+    def rates(self) -> FloatArray:
+        """The angular velocities (2, 3) at start and end, by straight lines through what is near.
+
+        They serve as the rates at which poses move with the clock, for which single samples are too noisy. Both err
+        alike with the rotation over the whole interval, so that they do not bias what is learned of the clock.
+        """
+        return np.stack([_line_at_start(*each) for each in self._from_both_ends()])
+
+    @property
+    def mean_rates(self) -> FloatArray:
+        """Mean angular velocities (2, 3) near start and end: less noisy, but half of AT_ONCE_S from where they end.
+
+        Those of the windows on both sides of a frame make a mean about it.
+        """
+        return np.stack([_mean_at_start(*each) for each in self._from_both_ends()])
+
+    def _from_both_ends(self) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+        return (self.durations, self.angular_velocity), (self.durations[::-1], self.angular_velocity[::-1])
+
+
+def _mean_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
+    """Of means (M, 3) over durations (M,), that over the first AT_ONCE_S."""
+    ends = np.minimum(np.cumsum(durations), AT_ONCE_S)
+    return np.asarray(np.diff(ends, prepend=0.0) @ means / ends[-1])
+
+
+def _line_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
+    """Where a straight line through means (M, 3) over durations (M,) begins, from those of the first EVENLY_S."""
+    ends = np.minimum(np.cumsum(durations), EVENLY_S)
+    weights = np.diff(ends, prepend=0.0)
+    middle = ends - weights / 2
+    mean, mean_s = weights @ means / ends[-1], weights @ middle / ends[-1]
+    spread = weights @ (middle - mean_s) ** 2
+    slope = (weights * (middle - mean_s)) @ means / spread if spread > 0.0 else np.zeros(3)
+    return np.asarray(mean - mean_s * slope)
 
 
 def turned(windows: Sequence[ImuWindow], bias: FloatArray) -> FloatArray:

@@ -26,7 +26,9 @@ lost, is such a state, too; to first order, so that positions far from there err
 said.
 
 For the same reason the scale error of the front end is only considered: it widens the covariance, and accelerations do
-not estimate it. What they tell of it within seconds is little beside gravity and their own bias.
+not estimate it. What they tell of it within seconds is little beside gravity and their own bias. The time offset is
+only considered, too: what a filter takes for knowledge of it is mostly noise in the rates of turning, which it has from
+one side only, and the pose graph has estimated it already.
 
 Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (error state, reset); Roumeliotis and Burdick,
 "Stochastic cloning", 2002.
@@ -67,11 +69,12 @@ UNKNOWN_TURN = np.pi / np.sqrt(3.0)  # rad: of an angle that may be any
 # Where the errors stand in the filter's state.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, GRAVITY_DIRECTION = slice(9, 12), slice(12, 15), slice(15, 17)
-FRONT_END, SCALE = slice(17, 21), 17  # scale error, rate bias
+FRONT_END = slice(17, 21)  # scale error, rate bias
 MOUNTING, LEVER_ARM, TIME_OFFSET, MISALIGNMENT = slice(21, 24), slice(24, 27), slice(27, 28), slice(28, 31)
 EXTRINSICS, MOUNTED = slice(21, 28), slice(21, 31)
 CLONE_ATTITUDE = slice(31, 34), slice(37, 40)  # at the last frame, and at the one before
 CLONE_POSITION = slice(34, 37), slice(40, 43)
+CONSIDERED = [17, 27]  # scale error and time offset
 DIMENSION = 43
 
 # Where the errors of the past stand: of the IMU's position on the trail at the frame before the last one, of the
@@ -198,8 +201,9 @@ def propagate(state: State, window: ImuWindow) -> tuple[State, FloatArray, Float
     by_noise = np.tile(np.eye(DIMENSION), (len(dt), 1, 1))
     by_noise[:, VELOCITY, ATTITUDE] = skew(v[1:])
     by_noise[:, POSITION, POSITION] = R[1:]
-    rate = window.angular_velocity[-1] - state.gyro_bias
-    return replace(state, R=R[-1], p=p, v=v[-1], rate=rate), F, by_noise
+    clone_twists = state.clone_twists.copy()
+    clone_twists[0, :3], rate = window.rates - state.gyro_bias
+    return replace(state, R=R[-1], p=p, v=v[-1], rate=rate, clone_twists=clone_twists), F, by_noise
 
 
 def shown_jacobian(state: State, shown: Prediction, since: int) -> FloatArray:
@@ -385,12 +389,12 @@ class Filter:
         self._move_error(H)
 
     def _consider(self, before: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        """Take back what an update by H and R did to the scale error; before: the covariance until then.
+        """Take back what an update by H and R did to what is only considered; before: the covariance until then.
 
-        Without its row the gain is not the best one, and the covariance follows by Joseph's form, which holds for any.
+        Without those rows the gain is not the best one, and the covariance follows by Joseph's form, good for any.
         """
         gain = self.kf.K.copy()
-        gain[SCALE] = 0.0
+        gain[CONSIDERED] = 0.0
         keep = np.eye(DIMENSION) - gain @ H
         self.kf.K, self.kf.x = gain, gain @ self.kf.y
         self.kf.P = keep @ before @ keep.T + gain @ R @ gain.T
@@ -614,8 +618,8 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
 
     Steps that it did not measure from start to end are predicted by constant velocity and rate; without any that it
     measured nothing is predicted, and the poses are those of the chain. Each pose is that of its own instant; what
-    loops tell of earlier ones is in `Estimate.hindsight`. Of the pairs that skip frames those over two steps are used;
-    positions are not.
+    loops tell of earlier ones is in `Estimate.hindsight`. Of the pairs that skip frames those over two steps are used,
+    where the IMU tells which of two that disagree is wrong; positions are not.
     """
     steps, calibration = measurements.steps, measurements.calibration
     samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
@@ -642,7 +646,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
             innovation, nis, used = np.full(6, np.nan), np.nan, True
         else:
             innovation, nis, used, in_a_row = _measure(ekf, pair, window, gate, in_a_row)
-        if (skip := skips.get(frame)) is not None and not lost:
+        if (skip := skips.get(frame)) is not None and window is not None:
             skips_rejected += not ekf.update_unless_outlier(_measurement(skip, config, since=1), gate)
         if stands and used:
             ekf.stand_still()

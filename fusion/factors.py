@@ -77,7 +77,7 @@ class PairFactors(Batch):
 
     The variables are X, T_world_imu; E(0) (10): how T_camera_imu strays from `T_camera_imu`, d, and m;
     S(knot) (4): scale error and rate bias of the front end, for those with knots (N,) that are not NO_KNOT. Without
-    twists (K, 6) of all poses there is no E: the poses are those of the camera.
+    twists (K, 6) of all poses there is no E: the poses are those of the camera. Those twists may change meanwhile.
     """
 
     def __init__(
@@ -98,8 +98,7 @@ class PairFactors(Batch):
         self.source, self.target, self._knots = source, target, knots
         self._T_camera_imu = T_camera_imu
         self._with_extrinsics = twists is not None
-        still = np.zeros((len(pairs), 6))
-        self._twists = (still, still) if twists is None else (twists[source], twists[target])
+        self._twists = twists if twists is not None else np.zeros((np.max(target, initial=0) + 1, 6))
         self._measured = motions_of(pairs).as_matrix() if pairs else np.zeros((0, 4, 4))
         self._seconds = np.array([pair.duration_s for pair in pairs])
         self._reference = _smooth(self._measured[:, :3, 3], self._seconds)
@@ -117,7 +116,7 @@ class PairFactors(Batch):
             poses[self.source],
             poses[self.target],
             extrinsics(self._T_camera_imu, strayed),
-            self._twists,
+            (self._twists[self.source], self._twists[self.target]),
             strayed[6],
             strayed[7:],
             front_end,

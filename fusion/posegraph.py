@@ -287,13 +287,20 @@ def _with_imu(
     _add_preintegrated(graph, windows, knots, bias, np.diff(seconds), config)
 
     twists = np.zeros((len(poses), 6))
-    rates = np.array(
-        [(k, *(window.durations @ window.angular_velocity / window.durations.sum())) for k, window in used]
-    )
-    middle = (seconds[:-1] + seconds[1:])[rates[:, 0].astype(int)] / 2
-    twists[:, :3] = np.stack([np.interp(seconds, middle, axis) for axis in rates[:, 1:].T], axis=1)
+    twists[:, :3] = _rates(used, seconds)
     twists[:, 3:] = np.einsum("nji,nj->ni", poses[:, :3, :3], velocities)
     return Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
+
+
+def _rates(windows: Sequence[tuple[int, ImuWindow]], seconds: FloatArray) -> FloatArray:
+    """The angular velocities (K, 3) at times (K,), from windows (with their step), linear where there are none."""
+    sums, counts = np.zeros((len(seconds), 3)), np.zeros(len(seconds))
+    for k, window in windows:
+        sums[k : k + 2] += window.mean_rates
+        counts[k : k + 2] += 1
+    known = counts > 0
+    rates = sums[known] / counts[known, None]
+    return np.stack([np.interp(seconds, seconds[known], axis) for axis in rates.T], axis=1)
 
 
 def _add_bias_walk(
@@ -430,6 +437,7 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
         for batch in problem.batches:
             batch.update(values)
         if iteration == FORGIVING_ITERATIONS:
+            _renew_velocities(problem, values)
             width = max(batch.squared.max(initial=0.0) / gate for batch, gate in zip(judged, gates, strict=True))
         if iteration >= FORGIVING_ITERATIONS:
             width = _reweigh(judged, gates, width, config.robust)
@@ -453,6 +461,13 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
         return [key, *mounted] if kind in "xl" else [key] if kind in "bseu" else None
 
     return Solution(values, marginals.covariances(net, wanted))
+
+
+def _renew_velocities(problem: Problem, values: gtsam.Values) -> None:
+    """Take the velocities with which poses move with the clock from the solution: those of single pairs are noisy."""
+    if problem.twists is not None:
+        velocities = gtsam.utilities.extractVectors(values, "v")
+        problem.twists[:, 3:] = np.einsum("nji,nj->ni", poses_of(values)[:, :3, :3], velocities)
 
 
 def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> None:
