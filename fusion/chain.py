@@ -76,10 +76,11 @@ def _mean_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
 
 def _line_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
     """Where a straight line through means (M, 3) over durations (M,) begins, from those of the first EVENLY_S."""
-    ends = np.minimum(np.cumsum(durations), EVENLY_S)
-    weights = np.diff(ends, prepend=0.0)
-    middle = ends - weights / 2
-    mean, mean_s = weights @ means / ends[-1], weights @ middle / ends[-1]
+    passed = np.cumsum(durations)
+    weights = np.diff(np.minimum(passed, EVENLY_S), prepend=0.0)
+    weights /= weights.sum()
+    middle = passed - durations / 2
+    mean, mean_s = weights @ means, weights @ middle
     spread = weights @ (middle - mean_s) ** 2
     slope = (weights * (middle - mean_s)) @ means / spread if spread > 0.0 else np.zeros(3)
     return np.asarray(mean - mean_s * slope)

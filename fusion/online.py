@@ -224,7 +224,7 @@ class Smoother:
             fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
             self._factors.append(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), fixed))
             return
-        self._twist = self._twist_by(0, inertial, 0)
+        self._twist = self._twists_by(0, inertial)[0]
         velocity = self._T_camera_imu[:3, :3] @ self._twist[3:]
         bias = _first_bias(calibration)
         bias_sigmas = [config.accelerometer_bias_sigma, np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)]
@@ -252,12 +252,12 @@ class Smoother:
         covariance = block_diag(R.T @ np.diag(rotation_std**2) @ R, np.diag(others**2))
         return np.zeros(10), np.asarray(covariance)
 
-    def _twist_by(self, step: int, inertial: _Inertial | None, piece: int) -> FloatArray:
-        """The twist (6,) of the IMU at an end of a step, where its first or last piece is; without one its mean."""
-        twist = self._by_pairs[step].copy()
+    def _twists_by(self, step: int, inertial: _Inertial | None) -> FloatArray:
+        """The twists (2, 6) of the IMU at both ends of a step; where it measured no rates, their mean."""
+        twists = np.tile(self._by_pairs[step], (2, 1))
         if inertial is not None:
-            twist[:3] = inertial.window.angular_velocity[piece]
-        return np.asarray(twist)
+            twists[:, :3] = inertial.window.rates
+        return twists
 
     def _predict(self, step: int) -> None:
         """The variables of a frame where the pair takes them."""
@@ -310,8 +310,8 @@ class Smoother:
     def _add_pair(self, step: int, inertial: _Inertial | None, weight: float) -> None:
         twists = np.zeros((2, 6))
         if self._calibration is not None:
-            twist = self._twist_by(step, inertial, -1)
-            twists, self._twist = np.stack([self._twist, twist]), twist
+            twists = self._twists_by(step, inertial)
+            self._twist = twists[1]
         whitener = np.linalg.inv(np.linalg.cholesky(self._steps[step].covariance))
         self._pairs[step] = _Pair(step, self._knots[step], whitener, twists, weight)
         keys = self._keys_of(self._pairs[step])

@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion.chain import ImuWindows, adjoint, bridge_gaps, chain, motions_of
+from fusion import chain as chain_module
+from fusion.chain import ImuWindow, ImuWindows, adjoint, bridge_gaps, chain, motions_of
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, PairEstimate
 
@@ -197,6 +200,34 @@ def test_imu_windows_integrate_what_is_linear_between_samples() -> None:
     assert_allclose(window.durations.sum(), 0.145, atol=1e-12)
     turned = window.durations @ window.angular_velocity
     assert_allclose(turned, np.array([1.0, -2.0, 3.0]) * (0.248**2 - 0.103**2) / 2, atol=1e-12)
+
+
+def test_the_rates_at_the_ends_of_a_window_are_exact_where_they_change_evenly() -> None:
+    """And the means near the ends lag behind them by half of what they are means of."""
+    imu = _imu(np.zeros(3), 1.0)
+    slope = np.array([1.0, -2.0, 3.0])
+    ramp = replace(imu, angular_velocity=np.outer((imu.stamps_ns - START_NS) / NANOSECONDS, slope))
+    window = ImuWindows(ramp).over(START_NS + 103_000_000, START_NS + 248_000_000)
+    assert window is not None
+    assert_allclose(window.rates, np.outer([0.103, 0.248], slope), atol=1e-12)
+    start_ns, end_ns = imu.stamps_ns[[20, 35]].tolist()
+    window = ImuWindows(ramp).over(start_ns, end_ns)
+    assert window is not None
+    lag_s, ends_s = chain_module.AT_ONCE_S / 2, (np.array([start_ns, end_ns]) - START_NS) / NANOSECONDS
+    assert_allclose(window.mean_rates, np.outer(ends_s + [lag_s, -lag_s], slope), atol=1e-9)
+
+
+@given(seed=st.integers(0, 2**32 - 1), pieces=st.integers(1, 30))
+def test_noise_turns_the_rates_at_both_ends_of_a_window_alike(seed: int, pieces: int) -> None:
+    """So that their difference errs independently of the rotation over it: white noise of pieces that differ in length.
+
+    Means over shorter times err by more, so that the covariance of a sum and a weighted mean is the sum of its weights.
+    """
+    rng = np.random.default_rng(seed)
+    durations = rng.uniform(0.001, 0.02, pieces)
+    units = np.stack([np.eye(pieces)[k][:, None] * np.ones(3) for k in range(pieces)])
+    by_piece = np.stack([ImuWindow(durations, unit, unit).rates[:, 0] for unit in units])  # weights of each piece
+    assert_allclose(by_piece.sum(axis=0), 1.0, atol=1e-6)
 
 
 def test_an_imu_window_rotates_by_the_rate_less_the_bias() -> None:
