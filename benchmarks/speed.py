@@ -175,9 +175,16 @@ def lapped(model: VIOLearner, laps: Laps) -> Iterator[None]:
 
     after("pyramid", "preprocess: pyramid")
     after("level_0", "IMU net")
+    passed = 0  # how often the last level was taken
+
+    def before_last_level(*_: Any) -> None:
+        nonlocal passed
+        laps("hypotheses" if passed % model.config.passes[3] else "levels 1 to 3")
+        passed += 1
+
     hooks = [
         model.register_forward_pre_hook(lambda *_: laps("preprocess: batch")),
-        model.trunks[3].register_forward_pre_hook(lambda *_: laps("levels 1 to 3")),
+        model.trunks[3].register_forward_pre_hook(before_last_level),
         model.register_forward_hook(lambda *_: laps("hypotheses")),
     ]
     try:

@@ -110,24 +110,6 @@ class PhotometricError:
         return torch.cat([(slope[..., None] * seen).sum(1) for slope in slopes], dim=-1).permute(0, 3, 1, 2)
 
 
-def chosen(outcomes: list[PhotometricError], index: Tensor) -> PhotometricError:
-    """Of several warps of the same pairs, that of index (B,) for each pair."""
-    rows = torch.arange(len(index), device=index.device)
-
-    def pick(values: list[Tensor]) -> Tensor:
-        return torch.stack(values, dim=1)[rows, index]
-
-    return PhotometricError(
-        error=pick([o.error for o in outcomes]),
-        warped=pick([o.warped for o in outcomes]),
-        sampled=outcomes[0].sampled,
-        grid=pick([o.grid for o in outcomes]),
-        residual=pick([o.residual for o in outcomes]),
-        visible=pick([o.visible for o in outcomes]),
-        widths=outcomes[0].widths,
-    )
-
-
 def photometric_error(
     sampled: Tensor,
     reference: Tensor,

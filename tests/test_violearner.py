@@ -78,7 +78,7 @@ def test_winner_has_the_lowest_error(model: VIOLearner) -> None:
 
 def test_a_level_taken_twice_starts_again_from_its_own_correction(model: VIOLearner) -> None:
     batch = random_batch(SMALL)
-    twice = VIOLearner(dataclasses.replace(SMALL, passes=2))
+    twice = VIOLearner(dataclasses.replace(SMALL, passes=(2, 2, 2, 2)))
     twice.load_state_dict(model.state_dict())
     views, estimate = twice.pyramid(batch), twice(batch)
 
@@ -95,7 +95,7 @@ def test_a_level_taken_twice_starts_again_from_its_own_correction(model: VIOLear
 def test_the_last_level_taken_twice_starts_again_from_its_winner(model: VIOLearner) -> None:
     batch = random_batch(SMALL)
     once, views = model(batch), model.pyramid(batch)
-    twice = VIOLearner(dataclasses.replace(SMALL, passes=2))
+    twice = VIOLearner(dataclasses.replace(SMALL, passes=(2, 2, 2, 2)))
     twice.load_state_dict(model.state_dict())
     for trunk, refinement in zip(twice.trunks[:3], twice.refinements, strict=True):  # levels 1 to 3 do nothing
         for layer in (trunk, refinement):
