@@ -29,8 +29,8 @@ MAX_IMU_PERIODS = 2.5
 # So many samples that all show the same are those of a sensor that is stuck.
 MIN_REPEATS = 4
 
-# So long a carrier turns at one rate, nearly, and at one that changes evenly.
-AT_ONCE_S, EVENLY_S = 0.03, 0.1
+# So long a carrier turns at a rate that changes evenly, nearly.
+EVENLY_S = 0.1
 
 
 class ImuWindow(NamedTuple):
@@ -54,24 +54,8 @@ class ImuWindow(NamedTuple):
         They serve as the rates at which poses move with the clock, for which single samples are too noisy. Both err
         alike with the rotation over the whole interval, so that they do not bias what is learned of the clock.
         """
-        return np.stack([_line_at_start(*each) for each in self._from_both_ends()])
-
-    @property
-    def mean_rates(self) -> FloatArray:
-        """Mean angular velocities (2, 3) near start and end: less noisy, but half of AT_ONCE_S from where they end.
-
-        Those of the windows on both sides of a frame make a mean about it.
-        """
-        return np.stack([_mean_at_start(*each) for each in self._from_both_ends()])
-
-    def _from_both_ends(self) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-        return (self.durations, self.angular_velocity), (self.durations[::-1], self.angular_velocity[::-1])
-
-
-def _mean_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
-    """Of means (M, 3) over durations (M,), that over the first AT_ONCE_S."""
-    ends = np.minimum(np.cumsum(durations), AT_ONCE_S)
-    return np.asarray(np.diff(ends, prepend=0.0) @ means / ends[-1])
+        both = (self.durations, self.angular_velocity), (self.durations[::-1], self.angular_velocity[::-1])
+        return np.stack([_line_at_start(*each) for each in both])
 
 
 def _line_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
@@ -88,15 +72,38 @@ def _line_at_start(durations: FloatArray, means: FloatArray) -> FloatArray:
 
 def turned(windows: Sequence[ImuWindow], bias: FloatArray) -> FloatArray:
     """The rotation vectors (N, 3) of what the gyro, less its bias (3,) rad/s, turned during N windows."""
-    pieces = max((len(window.durations) for window in windows), default=0)
-    rotvecs = np.zeros((len(windows), pieces, 3))
-    for row, window in zip(rotvecs, windows, strict=True):
-        row[: len(window.durations)] = (window.angular_velocity - bias) * window.durations[:, None]
+    durations, rates = _side_by_side(windows)
+    pieces = durations.shape[1]
+    rotvecs = (rates - bias) * durations[:, :, None]
     increments = Rotation.from_rotvec(rotvecs.reshape(-1, 3)).as_matrix().reshape(-1, pieces, 3, 3)
     whole = np.tile(np.eye(3), (len(windows), 1, 1))
     for piece in range(pieces):
         whole = whole @ increments[:, piece]
     return np.asarray(Rotation.from_matrix(whole).as_rotvec())
+
+
+def mean_rates(windows: Sequence[ImuWindow], span_s: float) -> FloatArray:
+    """Mean angular velocities (N, 2, 3) over so many seconds after the start and before the end of N windows.
+
+    Those of the windows on both sides of a frame make a mean about it.
+    """
+    durations, rates = _side_by_side(windows)
+    passed = np.cumsum(durations, axis=1)
+    left = passed[:, -1:] - passed
+    after_start = np.diff(np.minimum(passed, span_s), prepend=0.0)
+    before_end = np.minimum(left + durations, span_s) - np.minimum(left, span_s)
+    weights = np.stack([after_start, before_end], axis=1)
+    return np.asarray(weights @ rates / weights.sum(axis=2, keepdims=True))
+
+
+def _side_by_side(windows: Sequence[ImuWindow]) -> tuple[FloatArray, FloatArray]:
+    """Durations (N, M) and angular velocities (N, M, 3) of N windows, those of fewer pieces followed by zeros."""
+    pieces = max((len(window.durations) for window in windows), default=0)
+    durations, rates = np.zeros((len(windows), pieces)), np.zeros((len(windows), pieces, 3))
+    for k, window in enumerate(windows):
+        durations[k, : len(window.durations)] = window.durations
+        rates[k, : len(window.durations)] = window.angular_velocity
+    return durations, rates
 
 
 class ImuWindows:

@@ -29,7 +29,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
 from fusion import gnss, marginals, outliers
-from fusion.chain import ImuWindow, ImuWindows, chain, motions_of
+from fusion.chain import ImuWindow, ImuWindows, chain, mean_rates, motions_of
 from fusion.config import PoseGraphConfig, Robust
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
 from fusion.imu import ImuCalibration
@@ -43,6 +43,7 @@ GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the acceler
 GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first direction of gravity
 FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that the solver suffers
 INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
+RATE_SPANS_S = (0.03, 0.06, 0.1)  # to each side of a frame: so long a carrier turns at one rate, nearly
 MIN_WINDOWS = 20
 MAX_CONTRADICTED = 0.2  # share of the pairs: where more seem to be wrong, it is the IMU that is
 # Median, over so many steps, of the squared errors of IMU factors; rough roads have up to 5.5 and 2.6.
@@ -287,20 +288,35 @@ def _with_imu(
     _add_preintegrated(graph, windows, knots, bias, np.diff(seconds), config)
 
     twists = np.zeros((len(poses), 6))
-    twists[:, :3] = _rates(used, seconds)
+    twists[:, :3] = _rates(used, seconds, config.gyro_noise)
     twists[:, 3:] = np.einsum("nji,nj->ni", poses[:, :3, :3], velocities)
     return Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
 
 
-def _rates(windows: Sequence[tuple[int, ImuWindow]], seconds: FloatArray) -> FloatArray:
-    """The angular velocities (K, 3) at times (K,), from windows (with their step), linear where there are none."""
+def _rates(windows: Sequence[tuple[int, ImuWindow]], seconds: FloatArray, gyro_noise: float) -> FloatArray:
+    """The angular velocities (K, 3) at times (K,), from windows (with their step), linear where there are none.
+
+    They are the rates at which poses move with the clock: their noise would pass for knowledge of it. Means over a
+    longer time have less, but a carrier may have turned otherwise meanwhile. Of nested means of white noise the shorter
+    one r and the longer one s have E |r - s|^2 = |bias of s|^2 + v_r - v_s, so that the data tell which errs least
+    (Stein, "Estimation of the mean of a multivariate normal distribution", 1981).
+    """
+    means = [_mean_rates(windows, seconds, span_s) for span_s in RATE_SPANS_S]
+    variances = [gyro_noise**2 / (2 * span_s) for span_s in RATE_SPANS_S]
+    risks = [np.mean((rates - means[0]) ** 2) + 2 * v for rates, v in zip(means, variances, strict=True)]
+    return means[int(np.argmin(risks))]
+
+
+def _mean_rates(windows: Sequence[tuple[int, ImuWindow]], seconds: FloatArray, span_s: float) -> FloatArray:
+    """The same as means over span_s on both sides of each."""
+    steps = np.array([k for k, _ in windows])
     sums, counts = np.zeros((len(seconds), 3)), np.zeros(len(seconds))
-    for k, window in windows:
-        sums[k : k + 2] += window.mean_rates
-        counts[k : k + 2] += 1
+    for side, rates in enumerate(mean_rates([window for _, window in windows], span_s).swapaxes(0, 1)):
+        sums[steps + side] += rates
+        counts[steps + side] += 1
     known = counts > 0
-    rates = sums[known] / counts[known, None]
-    return np.stack([np.interp(seconds, seconds[known], axis) for axis in rates.T], axis=1)
+    means = sums[known] / counts[known, None]
+    return np.stack([np.interp(seconds, seconds[known], axis) for axis in means.T], axis=1)
 
 
 def _add_bias_walk(

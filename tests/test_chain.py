@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion import chain as chain_module
-from fusion.chain import ImuWindow, ImuWindows, adjoint, bridge_gaps, chain, motions_of
+from fusion.chain import ImuWindow, ImuWindows, adjoint, bridge_gaps, chain, mean_rates, motions_of
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, PairEstimate
 
@@ -213,8 +212,11 @@ def test_the_rates_at_the_ends_of_a_window_are_exact_where_they_change_evenly() 
     start_ns, end_ns = imu.stamps_ns[[20, 35]].tolist()
     window = ImuWindows(ramp).over(start_ns, end_ns)
     assert window is not None
-    lag_s, ends_s = chain_module.AT_ONCE_S / 2, (np.array([start_ns, end_ns]) - START_NS) / NANOSECONDS
-    assert_allclose(window.mean_rates, np.outer(ends_s + [lag_s, -lag_s], slope), atol=1e-9)
+    ends_s = (np.array([start_ns, end_ns]) - START_NS) / NANOSECONDS
+    shorter = ImuWindow(*(values[:3] for values in window))
+    means = mean_rates([shorter, window], 0.06)
+    assert_allclose(means[1], np.outer(ends_s + [0.03, -0.03], slope), atol=1e-9)
+    assert_allclose(means[0, 1], shorter.durations @ shorter.angular_velocity / shorter.durations.sum(), atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1), pieces=st.integers(1, 30))

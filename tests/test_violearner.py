@@ -78,7 +78,7 @@ def test_winner_has_the_lowest_error(model: VIOLearner) -> None:
 
 def test_a_level_taken_twice_starts_again_from_its_own_correction(model: VIOLearner) -> None:
     batch = random_batch(SMALL)
-    twice = VIOLearner(dataclasses.replace(SMALL, passes=(2, 2, 2, 2)))
+    twice = VIOLearner(dataclasses.replace(SMALL, passes=(2, 2, 2, 2))).eval()
     twice.load_state_dict(model.state_dict())
     views, estimate = twice.pyramid(batch), twice(batch)
 
@@ -95,7 +95,7 @@ def test_a_level_taken_twice_starts_again_from_its_own_correction(model: VIOLear
 def test_the_last_level_taken_twice_starts_again_from_its_winner(model: VIOLearner) -> None:
     batch = random_batch(SMALL)
     once, views = model(batch), model.pyramid(batch)
-    twice = VIOLearner(dataclasses.replace(SMALL, passes=(2, 2, 2, 2)))
+    twice = VIOLearner(dataclasses.replace(SMALL, passes=(2, 2, 2, 2))).eval()
     twice.load_state_dict(model.state_dict())
     for trunk, refinement in zip(twice.trunks[:3], twice.refinements, strict=True):  # levels 1 to 3 do nothing
         for layer in (trunk, refinement):
@@ -108,6 +108,16 @@ def test_the_last_level_taken_twice_starts_again_from_its_winner(model: VIOLearn
     again = torch.stack([winner + h(features) * model.motion_scale for h in model.hypotheses], dim=1)
     torch.testing.assert_close(twice(batch).hypotheses, again)
     assert not torch.equal(once.poses[-1], winner)
+
+
+def test_levels_are_taken_as_often_as_training_and_inference_ask(model: VIOLearner) -> None:
+    batch = random_batch(SMALL)
+    both = VIOLearner(dataclasses.replace(SMALL, passes=(3, 1, 2, 2), training_passes=(1, 2, 1, 1)))
+    both.load_state_dict(model.state_dict())
+    for passes, training in ((both.config.passes, False), (both.config.training_passes, True)):
+        alone = VIOLearner(dataclasses.replace(SMALL, passes=passes)).eval()
+        alone.load_state_dict(model.state_dict())
+        assert torch.equal(both.train(training)(batch).poses[-1], alone(batch).poses[-1])
 
 
 def test_hypotheses_start_different(model: VIOLearner) -> None:
