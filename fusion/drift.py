@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.linalg.blas import dgemm
+from scipy.linalg.blas import dsyrk
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
@@ -26,6 +26,7 @@ from fusion_io.records import NANOSECONDS, FloatArray, IntArray, PairEstimate, T
 KEYFRAME_S = 2.0
 LOOP_KEYFRAME_S = 1.0  # where a loop arrives: what it tells of the way since the last keyframe stays with the next only
 ROOM = 32  # keyframes that the map grows by
+PENDING = 16  # loops whose corrections of the joint covariance are made all at once, in the time that one takes
 
 
 class Pose(NamedTuple):
@@ -118,7 +119,10 @@ class Map:
         self._places = [_Place(0, np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)))]
         self._keyframes = [0]  # their frames
         self._drifts = np.tile(np.eye(4), (ROOM, 1, 1))
+        # The lower triangle of a joint covariance C, and rows A: that of the drifts is C - A'A.
         self._covariance = np.zeros((6 * ROOM, 6 * ROOM), order="F")
+        self._told = np.zeros((6 * PENDING, 6 * ROOM))  # by the latest loops
+        self._pending = 0  # rows of it
         self._odometry_covariance = np.zeros((6, 6))  # of the last keyframe, when it was the latest frame
         self._latest_covariance = np.zeros((6, 6))
         self._closed = False
@@ -151,10 +155,12 @@ class Map:
         if number == len(self._drifts):
             self._drifts = np.concatenate([self._drifts, np.tile(np.eye(4), (ROOM, 1, 1))])
             self._covariance = np.asfortranarray(np.pad(self._covariance, (0, 6 * ROOM)))
-        here = _block(number)
-        self._covariance[here] = self._covariance[_block(before)]
-        self._covariance[:, here] = self._covariance[here].T
-        self._covariance[here, here] = self._covariance[_block(before), _block(before)] + own
+            self._told = np.pad(self._told, ((0, 0), (0, 6 * ROOM)))
+        here, there = _block(number), _block(before)
+        rows = self._recorded(before)
+        self._covariance[here, : here.start] = rows[:, : here.start]
+        self._covariance[here, here] = rows[:, there] + own
+        self._told[:, here] = self._told[:, there]
         self._drifts[number] = self._drifts[before]
         self._keyframes.append(len(self._places) - 1)
         self._places[-1] = self._places[-1]._replace(keyframe=number, own=np.zeros((6, 6)))
@@ -166,7 +172,7 @@ class Map:
         to_world = _adjoint(T)
         shown = inverse(T_source) @ T
         beyond = to_world @ _log(inverse(shown) @ np.asarray(loop.T_source_target.as_matrix()))
-        rows = self._rows(-1) - self._rows(source)
+        rows = self._rows(self._places[-1].keyframe) - self._rows(self._places[source].keyframe)
         of_latest = self._between(-1, -1) + own
         with_latest = of_latest - self._between(-1, source)
         apart = with_latest - self._between(source, -1) + self._between(source, source) + own_source
@@ -175,8 +181,11 @@ class Map:
         beyond, rows, row = (solve_triangular(root, each, lower=True) for each in (beyond, rows, with_latest.T))
         if beyond @ beyond > self._gate:
             return None
-        # Of this form it stays symmetric: what rounding leaves would grow from loop to loop.
-        dgemm(-1.0, rows, rows, beta=1.0, c=self._covariance, trans_a=True, overwrite_c=True)
+        self._told[self._pending : self._pending + 6] = rows
+        self._pending += 6
+        if self._pending == len(self._told):
+            dsyrk(-1.0, self._told, beta=1.0, c=self._covariance, trans=True, lower=True, overwrite_c=True)
+            self._pending = 0
         moved = RigidTransform.from_exp_coords((beyond @ rows).reshape(-1, 6))
         self._drifts = np.asarray(moved.as_matrix()) @ self._drifts
         self._closed = True
@@ -208,13 +217,28 @@ class Map:
         to_world = _adjoint(T)
         return T, to_world @ own @ to_world.T
 
-    def _rows(self, frame: int) -> FloatArray:
-        """The covariances (6, 6 N) of a frame with all keyframes."""
-        return self._covariance[_block(self._places[frame].keyframe)]
+    def _rows(self, number: int) -> FloatArray:
+        """The covariances (6, 6 N) of a keyframe with all of them."""
+        told = self._told[: self._pending]
+        return self._recorded(number) - told[:, _block(number)].T @ told
+
+    def _recorded(self, number: int) -> FloatArray:
+        """The same before the pending loops."""
+        here = _block(number)
+        rows = np.hstack([self._covariance[here, : here.stop], self._covariance[here.stop :, here].T])
+        own = np.tril(rows[:, here])
+        rows[:, here] = own + np.tril(own, -1).T
+        return rows
 
     def _between(self, one: int, other: int) -> FloatArray:
         """The covariance (6, 6) of what two frames have from their keyframes."""
-        return np.asarray(self._rows(one)[:, _block(self._places[other].keyframe)])
+        earlier, later = sorted([self._places[one].keyframe, self._places[other].keyframe])
+        found = self._covariance[_block(later), _block(earlier)]
+        if earlier == later:
+            found = np.tril(found) + np.tril(found, -1).T
+        told = self._told[: self._pending]
+        found = found - told[:, _block(later)].T @ told[:, _block(earlier)]
+        return np.asarray(found if self._places[one].keyframe == later else found.T)
 
 
 def _block(number: int) -> slice:

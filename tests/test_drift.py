@@ -1,10 +1,12 @@
 """What a loop tells of an odometry that drifts: it spreads along the way as the drift did, and is honest about it."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
+from fusion import drift
 from fusion.drift import Closures, Map, Odometry
 from fusion_io.records import NANOSECONDS, FloatArray, PairEstimate, Trajectory
 
@@ -65,6 +67,23 @@ def test_a_loop_moves_what_is_between_its_ends_as_it_drifted() -> None:
     kept = 0.05**2 / (0.05**2 + 80 * 0.05**2)  # of the drift, by the loop's own noise
     drift = odometry.poses.translation[-1] - _truth()[-1]
     assert_allclose(causal.poses.translation[-1] - _truth()[-1], kept * drift, atol=1e-6)
+
+
+def test_how_many_loops_are_taken_together_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corrections of the joint covariance wait for others: until then they are taken from what is read of it."""
+    loops = [_loop(80 - k, k, np.array([0.01, 0.02, 0.03])) for k in range(45, 81, 5)]
+    outcomes = []
+    for pending in (1, 3, 100):
+        monkeypatch.setattr(drift, "PENDING", pending)
+        closures, causal = _walked(_errors(3), loops)
+        assert closures.used.all()
+        outcomes.append((causal, closures.hindsight()))
+    for found in outcomes[1:]:
+        for one, other in zip(outcomes[0], found, strict=True):
+            assert one.covariances is not None
+            assert other.covariances is not None
+            assert_allclose(other.poses.as_matrix(), one.poses.as_matrix(), atol=1e-9)
+            assert_allclose(other.covariances, one.covariances, atol=1e-9)
 
 
 def test_errors_are_as_large_as_stated() -> None:
