@@ -1,6 +1,6 @@
 """Whether the back ends know how wrong they are: Monte Carlo over drives whose errors are drawn from their model.
 
-``python benchmarks/consistency.py [--runs 50] [--seconds 30] [--hand] [--skips]`` solves drives of `benchmarks.drives`
+``python benchmarks/consistency.py [--runs 150] [--seconds 30] [--hand] [--skips]`` solves drives of `benchmarks.drives`
 with both back ends, and prints normalised squared errors by degree of freedom (1 is right, more is overconfident, less
 timid) with the 95 % chi-square bounds of their mean over all runs, and the same of the filter's innovations. It asserts
 nothing.
@@ -144,7 +144,7 @@ def bounds(squares_of_runs: list[Square], probability: float = 0.95) -> tuple[fl
 def main() -> None:
     """Simulate, solve, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=50)
+    parser.add_argument("--runs", type=int, default=150)
     parser.add_argument("--seconds", type=float, default=30.0, help="length of a drive")
     parser.add_argument("--hand", action="store_true", help="in the hand of somebody who walks, instead of a car")
     parser.add_argument("--skips", action="store_true", help="with pairs that skip a frame")

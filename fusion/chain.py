@@ -112,29 +112,33 @@ class ImuWindows:
     def __init__(self, imu: ImuSeries) -> None:
         self._stamps = imu.stamps_ns
         self._values = np.hstack([imu.angular_velocity, imu.linear_acceleration])
-        self._longest_ns = MAX_IMU_PERIODS * np.median(np.diff(self._stamps)) if len(imu) > 1 else 0.0
+        gaps = np.diff(self._stamps)
+        longest_ns = MAX_IMU_PERIODS * np.median(gaps) if len(imu) > 1 else 0.0
+        changed = np.diff(self._values, axis=0) != 0.0
+        # How many holes, changes of the gyro and of the accelerometer there are until each sample.
+        counted = np.column_stack([gaps > longest_ns, changed[:, :3].any(axis=1), changed[:, 3:].any(axis=1)])
+        self._until = np.cumsum(np.vstack([np.zeros((1, 3), np.int64), counted]), axis=0)
 
     def over(self, start_ns: int, end_ns: int) -> ImuWindow | None:
-        """The window from start to end, or None where the samples do not cover it without a hole, or are stuck."""
+        """The window from start to end, or None where the samples do not cover it without a hole, or are stuck.
+
+        Stuck is a sensor that repeats one value on all axes: a live one has noise.
+        """
         first = int(np.searchsorted(self._stamps, start_ns, side="right")) - 1
         last = int(np.searchsorted(self._stamps, end_ns))
         if first < 0 or last >= len(self._stamps):
             return None
-        stamps, values = self._stamps[first : last + 1], self._values[first : last + 1]
-        gaps = np.diff(stamps)
-        if np.max(gaps) > self._longest_ns or _stuck(values[:, :3]) or _stuck(values[:, 3:]):
+        holes, *changes = (self._until[last] - self._until[first]).tolist()
+        if holes or (last - first + 1 >= MIN_REPEATS and not all(changes)):
             return None
-        at_start = values[0] + (values[1] - values[0]) * ((start_ns - stamps[0]) / gaps[0])
-        at_end = values[-1] - (values[-1] - values[-2]) * ((stamps[-1] - end_ns) / gaps[-1])
-        edges = np.vstack([at_start, values[1:-1], at_end])
+        stamps, edges = self._stamps[first : last + 1], self._values[first : last + 1].copy()
+        at_start = edges[0] + (edges[1] - edges[0]) * ((start_ns - stamps[0]) / (stamps[1] - stamps[0]))
+        at_end = edges[-1] - (edges[-1] - edges[-2]) * ((stamps[-1] - end_ns) / (stamps[-1] - stamps[-2]))
+        edges[0], edges[-1] = at_start, at_end
         means = (edges[1:] + edges[:-1]) / 2
-        seconds = np.clip(stamps - start_ns, 0, end_ns - start_ns) / NANOSECONDS
-        return ImuWindow(np.diff(seconds), means[:, :3], means[:, 3:])
-
-
-def _stuck(values: FloatArray) -> bool:
-    """Whether samples (M, 3) repeat one value on all axes: a live sensor has noise."""
-    return len(values) >= MIN_REPEATS and not np.any(np.diff(values, axis=0))
+        seconds = (stamps - start_ns) / NANOSECONDS
+        seconds[0], seconds[-1] = 0.0, (end_ns - start_ns) / NANOSECONDS
+        return ImuWindow(seconds[1:] - seconds[:-1], means[:, :3], means[:, 3:])
 
 
 def adjoint(transform: RigidTransform) -> FloatArray:

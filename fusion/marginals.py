@@ -23,8 +23,8 @@ class Joint(NamedTuple):
 
     def of(self, keys: Sequence[int]) -> FloatArray:
         """The joint covariance of some of them, in this order."""
-        index = [row for key in keys for row in range(*self.rows[key])]
-        return np.asarray(self.covariance[np.ix_(index, index)])
+        index = np.array([row for key in keys for row in range(*self.rows[key])], np.intp)
+        return np.asarray(self.covariance[index[:, None], index])
 
 
 def covariances(net: gtsam.GaussianBayesNet, wanted: Callable[[int], Sequence[int] | None]) -> dict[int, FloatArray]:
