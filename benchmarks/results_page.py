@@ -144,8 +144,8 @@ REMARKS = {
     "published": """\
 A real system's odometry on KITTI 09, which stands in for a front end, with the real IMU of 100 Hz. The mounting and the
 time offset are estimated from the log alone and compared with a fit of the same kind to the rotations of the ground
-truth. What is left of the time offset is the odometry's: its own turning is ahead of the truth's by as much, slow or
-fast (below), which nothing in the log tells from an offset of the IMU. The noise of the accelerometer and the time over
+truth. What is left of the time offset is the odometry's: its own turning is ahead of the truth's, slow or fast (below),
+which nothing in the log tells from an offset of the IMU. The noise of the accelerometer and the time over
 which errors of a front end are correlated were chosen with this log and those of the next section in view, so that
 their figures are a little better than those of a new log.""",
     "noise": """\
