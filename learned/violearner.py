@@ -93,7 +93,7 @@ class NetworkConfig:
 
 
 PRESETS: dict[str, NetworkConfig] = {
-    "fast": NetworkConfig(passes=(4, 4, 4, 4), training_passes=(2, 2, 2, 2)),
+    "fast": NetworkConfig(passes=(3, 3, 3, 6), training_passes=(2, 2, 2, 2)),
     "paper": NetworkConfig(
         height=128,
         width=480,
