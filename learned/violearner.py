@@ -24,8 +24,8 @@ network on simulated streets.
   each pixel's ray and inverse depth beside the Jacobian, so that one network serves cameras of 60 to 110 degrees.
 * passes: levels 1 to 4 are learned steps of descent, and may be taken more than once. Taken twice by a network that was
   trained for once, the median error of simulated pairs fell from 27 to 18 mm and from 1.7 to 1.2 mrad; trained for
-  twice, to 14 mm and 1.0 mrad, and taken four times to 12 mm and 0.9 mrad. `fast` takes four, and two while it is
-  trained, where each costs three times as much; `paper` one.
+  twice, to 14 mm and 1.0 mrad; trained for longer, and taken 3, 3, 3 and 6 times, to 10 mm and 0.75 mrad. `fast` does
+  that, and takes each twice while it is trained, where it costs three times as much; `paper` takes each once.
 * lost_error: pixels that leave the image cost a constant, else a network learns to look away.
 * hypotheses: how much they share is not said. Both presets share the three large layers and separate the rest.
 * relaxed winner-take-all: losers get a small share of the gradient (`loser_share`), or hypotheses die;
