@@ -192,6 +192,26 @@ def test_noise_of_the_imu_is_a_density() -> None:
         assert_allclose(np.diag(graph.at(0).noiseModel().covariance())[:3], POSE_GRAPH.gyro_noise**2, rtol=0.02)
 
 
+@pytest.mark.parametrize(("hertz", "noise"), [(0.1, 0.01), (3.7, 0.01), (3.7, 1e-4), (1.3, 0.03)])
+def test_rates_are_means_over_the_span_that_errs_least(hertz: float, noise: float) -> None:
+    """Of a rate that swings slowly or fast beside white noise (rad/s/sqrt(Hz)): as if one had seen the truth."""
+    period_s, pieces, steps = 0.01, 10, 400
+    seconds = period_s * (np.arange(pieces * steps) + 0.5)
+    true = 0.3 * np.sin(2 * np.pi * hertz * seconds)
+    shown = true + np.random.default_rng(0).normal(size=len(true)) * noise / np.sqrt(period_s)
+    rates = np.repeat(shown[:, None], 3, axis=1).reshape(steps, pieces, 3)
+    windows = [(k, ImuWindow(np.full(pieces, period_s), each, each)) for k, each in enumerate(rates)]
+    frames = period_s * pieces * np.arange(steps + 1)
+    wanted = 0.3 * np.sin(2 * np.pi * hertz * frames)[1:-1]
+
+    found = posegraph._rates(windows, frames, noise)[1:-1, 0]
+    errors = [
+        np.mean((posegraph._mean_rates(windows, frames, span_s)[1:-1, 0] - wanted) ** 2)
+        for span_s in posegraph.RATE_SPANS_S
+    ]
+    assert np.mean((found - wanted) ** 2) == pytest.approx(min(errors))
+
+
 def test_the_imu_makes_orientations_better() -> None:
     """All along the drive."""
     drive = _drive()
