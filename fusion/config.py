@@ -99,7 +99,7 @@ class FusionConfig(Section):
     """
 
     gyro_noise: PositiveFloat = 1e-3
-    accelerometer_noise: PositiveFloat = 0.11
+    accelerometer_noise: PositiveFloat = 0.09
     gyro_bias_walk: PositiveFloat = 1e-5
     accelerometer_bias_walk: PositiveFloat = 1e-4
     gyro_bias_sigma: PositiveFloat = 2e-4
