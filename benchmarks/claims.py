@@ -156,10 +156,13 @@ def evaluate(weights: Weights, drives: list[Drive]) -> dict[str, Score]:
     truth = []
     for drive in drives:
         stamps = drive.truth.stamps_ns
-        for pair in infer(weights, iter(drive.frames), stamps, drive.imu, Counter()):
-            poses = pair.levels[0], pair.network.T_source_target.as_matrix(), pair.pair.T_source_target.as_matrix()
-            for name, pose in zip(ESTIMATES, poses, strict=True):
-                estimates[name].append(pose)
+        alone, refined = (
+            infer(weights, iter(drive.frames), stamps, drive.imu, Counter(), polish) for polish in (False, True)
+        )
+        for pair in alone:
+            estimates["level 0"].append(pair.levels[0])
+            estimates["network"].append(pair.pair.T_source_target.as_matrix())
+        estimates["refined"] += [each.pair.T_source_target.as_matrix() for each in refined]
         truth.append((drive.truth.poses[:-1].inv() * drive.truth.poses[1:]).as_matrix())
     return {name: score(name, np.stack(poses), np.concatenate(truth)) for name, poses in estimates.items()}
 

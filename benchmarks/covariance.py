@@ -168,8 +168,10 @@ def simulated(weights: Weights, seed: int, frames: int, size: tuple[int, int]) -
     rendered, imu, truth = simulation.clip(seed, frames, *size)
     rendered, reference = imperfect(rendered, truth, Rig(), np.random.default_rng([seed, 1]))
     truth = Trajectory(truth.stamps_ns, reference)
-    inferences = list(infer(weights, iter(rendered), truth.stamps_ns, imu, Counter()))
-    return Pairs.of(compare(inferences, truth), np.stack([i.network.errors for i in inferences]))
+    alone, refined = (
+        list(infer(weights, iter(rendered), truth.stamps_ns, imu, Counter(), polish)) for polish in (False, True)
+    )
+    return Pairs.of(compare(alone, refined, truth), np.stack([i.network.errors for i in alone]))
 
 
 def recorded(weights: Weights, path: Path) -> Pairs:
@@ -178,9 +180,11 @@ def recorded(weights: Weights, path: Path) -> Pairs:
     truth = log.ground_truth()
     if truth is None:
         raise SystemExit(f"{path}: no ground truth to judge by")
-    inferences = list(infer(weights, log.frames(), log.frame_stamps(), log.imu(), Counter()))
-    comparison = compare(inferences, truth)
-    errors = {i.pair.source_stamp_ns: i.network.errors for i in inferences}
+    alone, refined = (
+        list(infer(weights, log.frames(), log.frame_stamps(), log.imu(), Counter(), polish)) for polish in (False, True)
+    )
+    comparison = compare(alone, refined, truth)
+    errors = {i.pair.source_stamp_ns: i.network.errors for i in alone}
     return Pairs.of(comparison, np.stack([errors[stamp] for stamp in comparison.stamps_ns[:, 0].tolist()]))
 
 

@@ -119,7 +119,7 @@ def check_plain(config: NetworkConfig, pair: NetworkPair) -> float:
 def random_weights(config: NetworkConfig, kind: type[VIOLearner] = VIOLearner) -> Weights:
     """A network that has learned nothing."""
     torch.manual_seed(0)
-    return Weights(kind(config).eval(), CovarianceModel(), CovarianceModel())
+    return Weights(kind(config).eval(), CovarianceModel(), CovarianceModel(), CovarianceModel())
 
 
 def usable(log: Log) -> Iterator[CameraFrame]:

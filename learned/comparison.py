@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -40,9 +41,9 @@ class Estimates:
 class Comparison:
     """N pairs that the ground truth spans, in order of time.
 
-    stamps_ns (N, 2) of source and target; true T_source_target (N, 4, 4); after the levels (N, 5, 4, 4); of the
-    hypotheses (N, M, 4, 4), and which of them won (N,); the network's estimates, and those refined from them, which
-    are the network's own where `was_refined` (N,) is false.
+    stamps_ns (N, 2) of source and target; true T_source_target (N, 4, 4). Of the network alone: after the levels
+    (N, 5, 4, 4), the hypotheses (N, M, 4, 4), which of them won (N,), and its estimates. The refined estimates, which
+    are those that they started from where `was_refined` (N,) is false.
     """
 
     stamps_ns: IntArray
@@ -67,16 +68,17 @@ class Comparison:
         return pose_errors(self.stages[stage].T_source_target, self.truth)
 
 
-def compare(inferences: Sequence[Inference], truth: Trajectory) -> Comparison:
-    """The inferences whose frames the ground truth spans, beside it.
+def compare(alone: Sequence[Inference], refined: Sequence[Inference], truth: Trajectory) -> Comparison:
+    """The pairs whose frames the ground truth spans, inferred without and with refinement, beside it.
 
     Raises LogError, with no file named, where there is none.
     """
-    stamps = np.array([(i.pair.source_stamp_ns, i.pair.target_stamp_ns) for i in inferences]).reshape(-1, 2)
+    stamps = np.array([(i.pair.source_stamp_ns, i.pair.target_stamp_ns) for i in alone]).reshape(-1, 2)
     known = truth.covers(stamps[:, 0]) & truth.covers(stamps[:, 1])
     if not known.any():
-        raise LogError(f"none of its {len(inferences)} estimated pairs lies within the ground truth's stamps")
-    spanned = [inference for inference, judged in zip(inferences, known, strict=True) if judged]
+        raise LogError(f"none of its {len(alone)} estimated pairs lies within the ground truth's stamps")
+    spanned = list(compress(alone, known))
+    polished = list(compress(refined, known))
     stamps = stamps[known]
     return Comparison(
         stamps_ns=stamps,
@@ -85,8 +87,8 @@ def compare(inferences: Sequence[Inference], truth: Trajectory) -> Comparison:
         hypotheses=np.stack([hypothesis_matrices(i.network) for i in spanned]),
         winners=np.array([i.network.winner for i in spanned]),
         network=Estimates.of([i.network for i in spanned]),
-        refined=Estimates.of([i.pair for i in spanned]),
-        was_refined=np.array([i.refined for i in spanned]),
+        refined=Estimates.of([i.pair for i in polished]),
+        was_refined=np.array([i.refined for i in polished]),
     )
 
 

@@ -54,7 +54,7 @@ class Inference:
     """What is said of a pair.
 
     pair: the estimate to use, refined where refinement was asked for and found a lower error; network: that of the
-    network alone; levels (5, 4, 4): T_source_target after each level of the network.
+    network, the start of the refinement; levels (5, 4, 4): T_source_target after each level of the network.
     """
 
     pair: PairEstimate
@@ -141,9 +141,11 @@ def infer(
 ) -> Iterator[Inference]:
     """Run the network, and the refinement if asked for, over consecutive frames, a few pairs at a time.
 
+    A network whose estimates are refined says only where to start: its own are then less exact than without refinement.
     Frames, network and refinement are three stages that work at the same time, in threads of one operation each: that
     keeps the cores busier than threads within an operation, and the result does not depend on their number.
     """
+    weights = weights.as_start() if refined else weights
     weights = replace(weights, model=for_inference(weights.model))
     with single_threaded():
         ready = prefetched((ready_frame(f, weights.model.config, refined) for f in frames), FRAMES_AHEAD)

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from fusion_io.reader import Log
-    from fusion_io.records import CameraFrame, FloatArray, ImuSeries
+    from fusion_io.records import CameraFrame, FloatArray
     from learned.comparison import Comparison
-    from learned.weights import Weights
+    from learned.estimator import Inference
 
 # Modules that bring numpy or torch are imported by the function that needs them, so that --help answers at once.
 
@@ -117,12 +117,18 @@ def evaluate(path: Path, weights: Path | None = None, baselines: bool = False) -
         raise LogError(f"{path}: no ground truth to evaluate against")
     loaded, imu, stamps = weights_file.load(weights), log.imu(), log.frame_stamps()
     skipped: Counter[str] = Counter()
-    clock = Clock()
-    frames = track(log.frames(), "estimate", len(stamps))
-    inferences = list(infer(loaded, iter(frames), stamps, imu, skipped))
-    seconds = clock.per_item(len(inferences))
+
+    def timed(doing: str, refined: bool, counts: Counter[str]) -> tuple[list[Inference], dict[str, float]]:
+        """All pairs, and the seconds a pair of streaming them from the log."""
+        clock = Clock()
+        frames = track(log.frames(), doing, len(stamps))
+        inferences = list(infer(loaded, iter(frames), stamps, imu, counts, refined))
+        return inferences, clock.per_item(len(inferences))
+
+    refined, seconds = timed("estimate", True, skipped)
+    alone, seconds_alone = timed("estimate with the network alone", False, Counter())
     try:
-        comparison = compare(inferences, truth)
+        comparison = compare(alone, refined, truth)
     except LogError as error:
         raise LogError(f"{path}: {error}") from None
 
@@ -131,7 +137,7 @@ def evaluate(path: Path, weights: Path | None = None, baselines: bool = False) -
         found["baselines"].append({**score("IMU only (level 0)", comparison.levels[:, 0], comparison.truth)})
     if baselines:
         found["refined"] |= seconds
-        found["network"] |= time_network(log, loaded, imu)
+        found["network"] |= seconds_alone
         classical = classical_odometry(log, comparison)
         found["baselines"].append(classical.figures)
         kept = classical.found
@@ -155,17 +161,6 @@ class Clock:
         """Seconds of both for each of `count` items."""
         spent = perf_counter() - self._start[0], process_time() - self._start[1]
         return {name: seconds / max(count, 1) for name, seconds in zip(TIMED, spent, strict=True)}
-
-
-def time_network(log: Log, weights: Weights, imu: ImuSeries) -> dict[str, float]:
-    """Seconds a pair of the network without refinement, streamed from the log with decoding, as the others are."""
-    from fusion_io.progress import track
-    from learned.estimator import infer
-
-    stamps = log.frame_stamps()
-    clock = Clock()
-    frames = track(log.frames(), "time the network alone", len(stamps))
-    return clock.per_item(sum(1 for _ in infer(weights, iter(frames), stamps, imu, Counter(), refined=False)))
 
 
 class Classical(NamedTuple):

@@ -70,10 +70,9 @@ def to_channels(image: NDArray[np.uint8], channels: int) -> NDArray[np.uint8]:
 def resize_depth(depth: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Depth (H, W) m at another size by averaging valid inverse depths; 0 where too few are valid."""
     valid = (depth > 0) & (depth < np.inf)  # false for NaN as well
-    known = valid.astype(np.float32)
-    inverse = known / np.where(valid, depth, np.float32(1))
-    share = cv2.resize(known, (width, height), interpolation=cv2.INTER_AREA)
-    mean_inverse = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_AREA)
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=valid)
+    both = cv2.merge([valid.astype(np.float32), inverse])
+    share, mean_inverse = cv2.split(cv2.resize(both, (width, height), interpolation=cv2.INTER_AREA))
     enough = (share >= MIN_VALID_SHARE * np.count_nonzero(valid) / valid.size) & (mean_inverse > 0)
     return np.where(enough, share / np.where(enough, mean_inverse, 1), 0).astype(np.float32)
 

@@ -70,7 +70,7 @@ CONVERGED = 1e-5
 
 
 class Points(NamedTuple):
-    """Source pixels that take part: pixel (N, 2) at full resolution; point (N, 3) m in the source camera; used (N,)."""
+    """Source pixels that take part: pixel (2, N) at full resolution; point (3, N) m in the source camera; used (N,)."""
 
     pixel: Tensor
     point: Tensor
@@ -110,7 +110,7 @@ def prepare_full(frame: CameraFrame) -> FullFrame:
         height, width = (size // 2 for size in images[-1].shape)
         halved = cv2.resize(images[-1][: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
         images.append(np.asarray(halved, np.float32))
-    points = None if frame.depth is None else select_points(images[0], frame.depth, frame.camera.K)
+    points = None if frame.depth is None else select_points(image, frame.depth, frame.camera.K)
     return FullFrame([with_gradients(i) for i in images], points, torch.from_numpy(frame.camera.K))
 
 
@@ -120,23 +120,25 @@ def with_gradients(image: NDArray[np.float32]) -> Tensor:
     Central, because a one-sided difference shares a pixel's noise with the residual, and the sum over many pixels of
     their product moves every estimate the same way (by 0.03 pixels, a tenth of a milliradian a pair).
     """
-    x, y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=1, scale=0.5) for order in ((1, 0), (0, 1)))
-    return torch.from_numpy(np.stack([image, x, y]))
+    planes = np.empty((3, *image.shape), np.float32)
+    planes[0] = image
+    for plane, order in zip(planes[1:], ((1, 0), (0, 1)), strict=True):
+        cv2.Sobel(image, cv2.CV_32F, *order, dst=plane, ksize=1, scale=0.5)
+    return torch.from_numpy(planes)
 
 
-def select_points(image: NDArray[np.float32], depth: NDArray[np.float32], K: FloatArray) -> Points:
+def select_points(image: NDArray[np.uint8], depth: NDArray[np.float32], K: FloatArray) -> Points:
     """The pixel with the steepest gradient of every cell, if it has depth, inside of what has, and is steep enough."""
-    steepness = np.abs(cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8))
-    steepness += np.abs(cv2.Sobel(image, cv2.CV_32F, 0, 1, scale=1 / 8))
+    steepness = np.add(*(np.abs(along) for along in cv2.spatialGradient(image)))  # eight times that of Sobel, int16
     steepness *= inside(depth > NEAREST_DEPTH_M)  # false for NaN as well
     cell = max(1, round((image.size / POINTS) ** 0.5))
-    steepest, index = functional.max_pool2d(torch.from_numpy(steepness)[None], cell, return_indices=True)
+    steepest, index = functional.max_pool2d(torch.from_numpy(steepness).float()[None], cell, return_indices=True)
     index = index.flatten()
-    pixel = torch.stack([index % image.shape[1], index // image.shape[1]], dim=1).float()
-    used = steepest.flatten() > LEAST_GRADIENT
+    pixel = torch.stack([index % image.shape[1], index // image.shape[1]]).float()
+    used = steepest.flatten() > 8 * LEAST_GRADIENT
     z = torch.from_numpy(np.nan_to_num(depth.ravel()[index.numpy()], nan=1.0, posinf=1.0)).clamp(min=NEAREST_DEPTH_M)
-    ray = (pixel - torch.from_numpy(K[:2, 2]).float()) / torch.from_numpy(K[[0, 1], [0, 1]]).float()
-    return Points(pixel, torch.cat([ray * z[:, None], z[:, None]], dim=1), used)
+    ray = (pixel - torch.from_numpy(K[:2, 2:]).float()) / torch.from_numpy(K[[0, 1], [0, 1]])[:, None].float()
+    return Points(pixel, torch.cat([ray * z, z[None]]), used)
 
 
 def inside(measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -195,7 +197,7 @@ class State(NamedTuple):
 
 
 class Level(NamedTuple):
-    """One scale: B targets (3, h, w), and the source at its points, (B, N, 3): value and gradients."""
+    """One scale: B targets (3, h, w), and the source at its points, (B, 3, N): value and gradients."""
 
     targets: list[Tensor]
     own: Tensor
@@ -214,7 +216,7 @@ class Problem:
     ) -> None:
         """For the given scales, with every `share`-th point; starts and prior as in `refine`."""
         points = [source.points for source, _ in pairs if source.points is not None]
-        pixel, self.point, self.used = (torch.stack(v)[:, ::share] for v in zip(*points, strict=True))
+        pixel, self.point, self.used = (torch.stack(v)[..., ::share] for v in zip(*points, strict=True))
         self.K = torch.stack([source.K for source, _ in pairs])
         self.starts = RigidTransform.from_matrix(starts)
         self.prior_information = torch.linalg.inv(torch.from_numpy(prior))
@@ -231,7 +233,7 @@ class Problem:
         T = torch.from_numpy(T_target_source)
         view = self.look(level, T)
         weight = view.visible.double()
-        x, y = self.levels[level].own[..., 0].double(), view.values.double()
+        x, y = self.levels[level].own[:, 0].double(), view.values.double()
         count = weight.sum(1).clamp(min=1)
         mean_x, mean_y = (weight * x).sum(1) / count, (weight * y).sum(1) / count
         dx, dy = x - mean_x[:, None], y - mean_y[:, None]
@@ -253,7 +255,7 @@ class Problem:
     def linearise(self, level: int, state: State) -> tuple[Tensor, Tensor]:
         """Information (B, 8, 8) and gradient (B, 8) of the objective at a state: rotation, translation, light."""
         view = self.look(level, state.T_target_source)
-        values, own = self.levels[level].own[..., 0], self.levels[level].own[..., 1:]
+        values, own = self.levels[level].own[:, 0], self.levels[level].own[:, 1:]
         gain, offset = state.light[:, :1].float(), state.light[:, 1:].float()
         residual = view.values - gain * values - offset
         sigma = scale(residual, view.visible)
@@ -262,9 +264,9 @@ class Problem:
 
         gradients = 0.5 * (view.gradients + gain[..., None] * own)
         jacobian = self.jacobian(level, view, gradients, values)
-        weighted = jacobian * weight[..., None]
-        information = (weighted.transpose(1, 2) @ jacobian).double()
-        gradient = (weighted.transpose(1, 2) @ residual[..., None])[..., 0].double()
+        weighted = jacobian * weight[:, None]
+        information = (weighted @ jacobian.transpose(1, 2)).double()
+        gradient = (weighted @ residual[..., None])[..., 0].double()
 
         moved = self.starts.inv() * RigidTransform.from_matrix(state.T_target_source.numpy()).inv()
         off = torch.from_numpy(moved.as_exp_coords())  # a step on the left of theta takes away from this
@@ -278,18 +280,18 @@ class Problem:
         return information, gradient
 
     def jacobian(self, level: int, view: View, gradients: Tensor, values: Tensor) -> Tensor:
-        """The residuals' derivatives with respect to rotation, translation, gain and offset, (B, N, 8).
+        """The residuals' derivatives with respect to rotation, translation, gain and offset, (B, 8, N).
 
-        gradients (B, N, 2): of the image at this scale; values (B, N): of the source.
+        gradients (B, 2, N): of the image at this scale; values (B, N): of the source.
         """
         K = self.K.float()
-        gx = gradients[..., 0] * K[:, 0, 0, None] / 2**level
-        gy = gradients[..., 1] * K[:, 1, 1, None] / 2**level
+        gx = gradients[:, 0] * (K[:, 0, 0, None] / 2**level)
+        gy = gradients[:, 1] * (K[:, 1, 1, None] / 2**level)
         x, y, inverse_z = view.x, view.y, view.inverse_z
         gz = -(gx * x + gy * y)  # d residual / d point' = (gx, gy, gz) / z;  d point' / d step = (-[point']x, 1)
         rotation = [y * gz - gy, gx - x * gz, x * gy - y * gx]
         translation = [gx * inverse_z, gy * inverse_z, gz * inverse_z]
-        return torch.stack([*rotation, *translation, -values, torch.full_like(values, -1.0)], dim=2)
+        return torch.stack([*rotation, *translation, -values, torch.full_like(values, -1.0)], dim=1)
 
     def cost(self, level: int, state: State) -> Tensor:
         """A robust mean (B,) of the residuals in pixels of displacement; points out of view cost a pixel.
@@ -298,31 +300,30 @@ class Problem:
         """
         view = self.look(level, state.T_target_source)
         used = self.used
-        values, own = self.levels[level].own[..., 0], self.levels[level].own[..., 1:]
+        values, own = self.levels[level].own[:, 0], self.levels[level].own[:, 1:]
         residual = view.values - state.light[:, :1].float() * values - state.light[:, 1:].float()
         count = used.sum(1).clamp(min=1)
-        unit = ((own.abs().sum(2) * used).sum(1) / count).clamp(min=LEAST_GRADIENT)
+        unit = ((own.abs().sum(1) * used).sum(1) / count).clamp(min=LEAST_GRADIENT)
         pixels = torch.where(view.visible, residual / unit[:, None], torch.ones_like(residual))
         return (torch.log1p(pixels.square()) * used).sum(1) / count
 
     def look(self, level: int, T_target_source: Tensor) -> View:
         """Where the points land in the target, and what is seen there."""
         T, images = T_target_source.float(), self.levels[level].targets
-        point = self.point @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3]
-        inverse_z = 1 / point[..., 2].clamp(min=NEAREST_DEPTH_M)
-        x, y = point[..., 0] * inverse_z, point[..., 1] * inverse_z
+        x, y, z = (T[:, :3, :3] @ self.point + T[:, :3, 3:]).unbind(1)
+        inverse_z = 1 / z.clamp(min=NEAREST_DEPTH_M)
+        x, y = x * inverse_z, y * inverse_z
         K = self.K.float()
-        pixel = torch.stack([K[:, 0, 0, None] * x + K[:, 0, 2, None], K[:, 1, 1, None] * y + K[:, 1, 2, None]], dim=2)
-        grid = at_level(pixel, level)
+        column, row = K[:, 0, 0, None] * x + K[:, 0, 2, None], K[:, 1, 1, None] * y + K[:, 1, 2, None]
+        column, row = at_level(column, level), at_level(row, level)
         height, width = images[0].shape[-2:]
-        inside = (grid >= -0.5).all(2) & (grid[..., 0] <= width - 0.5) & (grid[..., 1] <= height - 0.5)
-        seen = interpolate(images, grid)
-        visible = inside & self.used & (point[..., 2] > NEAREST_DEPTH_M)
-        return View(seen[..., 0], seen[..., 1:], visible, x, y, inverse_z)
+        inside = (column >= -0.5) & (row >= -0.5) & (column <= width - 0.5) & (row <= height - 0.5)
+        seen = interpolate(images, torch.stack([column, row], dim=1))
+        return View(seen[:, 0], seen[:, 1:], inside & self.used & (z > NEAREST_DEPTH_M), x, y, inverse_z)
 
 
 class View(NamedTuple):
-    """The target at the points: values (B, N), gradients (B, N, 2), visible (B, N); x/z, y/z and 1/z of the points."""
+    """The target at the points: values (B, N), gradients (B, 2, N), visible (B, N); x/z, y/z and 1/z of the points."""
 
     values: Tensor
     gradients: Tensor
@@ -338,18 +339,21 @@ def inverse(T: FloatArray) -> FloatArray:
 
 
 def interpolate(images: list[Tensor], pixel: Tensor) -> Tensor:
-    """Bilinear samples (B, N, C) of B images (C, H, W) at pixels (B, N, 2); beyond the border, of the border."""
+    """Bilinear samples (B, C, N) of B images (C, H, W) at pixels (B, 2, N); beyond the border, of the border."""
     height, width = images[0].shape[-2:]
-    grid = pixel * pixel.new_tensor([2 / (width - 1), 2 / (height - 1)]) - 1  # -1 and 1 are the outermost centres
-    samples = [  # image by image: to stack full images costs more than to sample them
-        functional.grid_sample(image[None], g[None, None], align_corners=True, padding_mode="border")[0, :, 0]
-        for image, g in zip(images, grid, strict=True)
-    ]
-    return torch.stack(samples).transpose(1, 2)
+    grid = torch.stack(  # -1 and 1 are the outermost centres
+        [pixel[:, 0] * (2 / (width - 1)) - 1, pixel[:, 1] * (2 / (height - 1)) - 1], dim=2
+    )
+    return torch.stack(
+        [  # image by image: to stack full images costs more than to sample them
+            functional.grid_sample(image[None], g[None, None], align_corners=True, padding_mode="border")[0, :, 0]
+            for image, g in zip(images, grid, strict=True)
+        ]
+    )
 
 
 def at_level(pixel: Tensor, level: int) -> Tensor:
-    """Full-resolution pixel coordinates (..., 2) in an image halved `level` times; centres at integers."""
+    """Full-resolution pixel coordinates in an image halved `level` times; centres at integers."""
     return (pixel + 0.5) / 2.0**level - 0.5
 
 

@@ -15,7 +15,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,6 +23,7 @@ from fusion_io.command import answered, command_parser
 from fusion_io.errors import EXIT_OK, LogError, UsageError
 
 if TYPE_CHECKING:
+    from learned.covariance import CovarianceModel
     from learned.dataset import PairSet
     from learned.optimisation import Descent
     from learned.violearner import VIOLearner
@@ -323,28 +324,39 @@ def draw_training_curve(out: Path) -> None:
 def calibrate(model: VIOLearner, pairs: PairSet, refined_clips: int, device: str) -> tuple[Weights, dict[str, float]]:
     """Fit the covariances on one half of held-out simulation; the network's weights, and the figures on the other half.
 
-    That of the network's winner is fitted on pairs with and without their IMU, that of the refined pose on clips at
+    Those of the network's winner are fitted on pairs with and without their IMU, that of the refined pose on clips at
     full resolution.
     """
+    from learned.covariance import UNCALIBRATED
+    from learned.held_out import fit_refined
+    from learned.weights import Weights
+
+    covariance, figures = fit_winner(model, pairs, device)
+    weights = Weights(model, covariance, UNCALIBRATED, UNCALIBRATED)
+    start_covariance, start_figures = fit_winner(weights.as_start().model, pairs, device)
+    weights = replace(weights, model=model.cpu(), start_covariance=start_covariance)
+    refined_covariance, refined_figures = fit_refined(weights, refined_clips)
+    starts = {f"start_{name}": value for name, value in start_figures.items()}
+    return replace(weights, refined_covariance=refined_covariance), figures | starts | refined_figures
+
+
+def fit_winner(model: VIOLearner, pairs: PairSet, device: str) -> tuple[CovarianceModel, dict[str, float]]:
+    """The covariance of the network's winner, fitted on one half of the pairs, and the figures on the other half."""
     import numpy as np
 
-    from learned.covariance import UNCALIBRATED, fit, hypothesis_spread, mean_nees, pooled, pose_errors
-    from learned.held_out import fit_refined
+    from learned.covariance import fit, hypothesis_spread, mean_nees, pooled, pose_errors
     from learned.optimisation import run
-    from learned.weights import Weights
 
     true, half = pairs.values("T_source_target"), len(pairs) // 2
     results = [run(model, pairs, device, with_imu) for with_imu in (True, False)]
     errors = [pose_errors(result["poses"][:, -1], true) for result in results]
     spread = [pooled(hypothesis_spread(result["hypotheses"], result["poses"][:, -1])) for result in results]
     covariance = fit(errors[0][:half], spread[0][:half], errors[1][:half], spread[1][:half])
-    refined_covariance, figures = fit_refined(Weights(model.cpu(), covariance, UNCALIBRATED), refined_clips)
     rest = errors[0][half:]
-    return Weights(model, covariance, refined_covariance), {
+    return covariance, {
         "translation_rmse_m": float(np.sqrt((rest[:, 3:] ** 2).sum(1).mean())),
         "rotation_rmse_rad": float(np.sqrt((rest[:, :3] ** 2).sum(1).mean())),
         "anees": mean_nees(rest, covariance.covariance(spread[0][half:], np.ones(len(rest)))),
-        **figures,
     }
 
 

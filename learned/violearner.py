@@ -25,7 +25,8 @@ network on simulated streets.
 * passes: levels 1 to 4 are learned steps of descent, and may be taken more than once. Taken twice by a network that was
   trained for once, the median error of simulated pairs fell from 27 to 18 mm and from 1.7 to 1.2 mrad; trained for
   twice, to 14 mm and 1.0 mrad; trained for longer, and taken 3, 3, 3 and 6 times, to 10 mm and 0.75 mrad. `fast` does
-  that, and takes each twice while it is trained, where it costs three times as much; `paper` takes each once.
+  that, and takes each twice while it is trained, where it costs three times as much; `paper` takes each once. Where a
+  refinement follows (`learned.refinement`), the network has to say only where to start (`starting_passes`).
 * lost_error: pixels that leave the image cost a constant, else a network learns to look away.
 * hypotheses: how much they share is not said. Both presets share the three large layers and separate the rest.
 * relaxed winner-take-all: losers get a small share of the gradient (`loser_share`), or hypotheses die;
@@ -87,13 +88,14 @@ class NetworkConfig:
     geometry: bool = True
     passes: tuple[int, int, int, int] = (1, 1, 1, 1)
     training_passes: tuple[int, int, int, int] = (1, 1, 1, 1)
+    starting_passes: tuple[int, int, int, int] = (1, 1, 1, 1)
     lost_error: float = 2.0
     loser_share: float = 0.1
     motion_scale: tuple[float, float, float, float, float, float] = (0.01, 0.01, 0.01, 0.05, 0.05, 0.5)
 
 
 PRESETS: dict[str, NetworkConfig] = {
-    "fast": NetworkConfig(passes=(3, 3, 3, 6), training_passes=(2, 2, 2, 2)),
+    "fast": NetworkConfig(passes=(3, 3, 3, 6), training_passes=(2, 2, 2, 2), starting_passes=(3, 3, 3, 1)),
     "paper": NetworkConfig(
         height=128,
         width=480,

@@ -14,7 +14,7 @@ from learned.dataset import PairSet
 from learned.weights import Weights
 
 QUICK = Adaptation(steps=8, batch=4, check_every=2, averaging=0.5)
-WEIGHTS = Weights(new_model(), CovarianceModel(missing_imu=0.5), CovarianceModel())
+WEIGHTS = Weights(new_model(), CovarianceModel(missing_imu=0.5), CovarianceModel(), CovarianceModel())
 
 
 def pairs() -> PairSet:

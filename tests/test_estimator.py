@@ -56,7 +56,7 @@ def still_frames(count: int) -> list[CameraFrame]:
 def weights_path(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     path = tmp_path / "tiny.pt"
-    weights.save(path, weights.Weights(VIOLearner(TINY), CovarianceModel(), CovarianceModel()), {})
+    weights.save(path, weights.Weights(VIOLearner(TINY), CovarianceModel(), CovarianceModel(), CovarianceModel()), {})
     return path
 
 

@@ -23,7 +23,7 @@ TINY = NetworkConfig(height=32, width=64, trunk_filters=4, extra_filters=4, imu_
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "tiny.pt"
-    weights.save(path, Weights(VIOLearner(TINY), CovarianceModel(), CovarianceModel()), {})
+    weights.save(path, Weights(VIOLearner(TINY), CovarianceModel(), CovarianceModel(), CovarianceModel()), {})
     return path
 
 

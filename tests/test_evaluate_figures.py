@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, PairEstimate, Trajectory
 from learned.calibration import AXES
-from learned.comparison import compare, figures
+from learned.comparison import Comparison, compare, figures
 from learned.estimator import Inference
 
 TENTH = NANOSECONDS // 10
@@ -95,15 +95,20 @@ def _inference(source_ns: int, z: float) -> Inference:
     return Inference(pair, pair, np.repeat(pair.T_source_target.as_matrix()[None], 5, axis=0))
 
 
+def compared(inferences: list[Inference], truth: Trajectory) -> Comparison:
+    """With nothing refined."""
+    return compare(inferences, inferences, truth)
+
+
 def test_ground_truth_is_interpolated_to_the_stamps_of_the_frames() -> None:
-    found = compare([_inference(TENTH // 3, 0.1)], _truth([0, TENTH, 2 * TENTH]))
+    found = compared([_inference(TENTH // 3, 0.1)], _truth([0, TENTH, 2 * TENTH]))
     assert found.truth[0, :3, 3] == pytest.approx([0, 0, 0.1])
     assert figures(found)["translation_rmse_m"] == pytest.approx(0, abs=1e-12)
 
 
 def test_pairs_outside_the_ground_truth_are_not_judged() -> None:
     inferences = [_inference(k * TENTH, 0.1) for k in range(10)]
-    assert len(compare(inferences, _truth([2 * TENTH, 5 * TENTH]))) == 3
+    assert len(compared(inferences, _truth([2 * TENTH, 5 * TENTH]))) == 3
 
 
 def test_pairs_in_a_long_hole_of_the_ground_truth_are_not_judged() -> None:
@@ -115,9 +120,9 @@ def test_pairs_in_a_long_hole_of_the_ground_truth_are_not_judged() -> None:
 @pytest.mark.parametrize("stamps_ns", [[0], [99 * NANOSECONDS, 100 * NANOSECONDS]])
 def test_ground_truth_that_spans_no_pair_is_refused(stamps_ns: list[int]) -> None:
     with pytest.raises(LogError, match="none of its 1 estimated pairs"):
-        compare([_inference(0, 0.1)], _truth(stamps_ns))
+        compared([_inference(0, 0.1)], _truth(stamps_ns))
 
 
 def test_no_estimates_at_all_are_refused() -> None:
     with pytest.raises(LogError, match="none of its 0 estimated pairs"):
-        compare([], _truth([0, TENTH]))
+        compared([], _truth([0, TENTH]))

@@ -99,7 +99,9 @@ def test_a_training_begins_with_the_weights_of_a_file(tmp_path: Path) -> None:
     torch.manual_seed(1)
     start = VIOLearner(TINY)
     start.imu_mean += 1.0
-    weights.save(tmp_path / "start.pt", weights.Weights(start, CovarianceModel(), CovarianceModel()), {})
+    weights.save(
+        tmp_path / "start.pt", weights.Weights(start, CovarianceModel(), CovarianceModel(), CovarianceModel()), {}
+    )
     torch.manual_seed(2)
     model = VIOLearner(dataclasses.replace(TINY, passes=(2, 2, 2, 2)))  # how often a level is taken changes no shape
     train.begin_with(model, tmp_path / "start.pt")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from copy import copy
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,24 @@ from learned.covariance import CovarianceModel
 from learned.violearner import NetworkConfig, VIOLearner
 
 DEFAULT = Path(__file__).with_name("fast.pt")
-FORMAT = 2
+FORMAT = 3
+COVARIANCES = ("covariance", "start_covariance", "refined_covariance")
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A trained network, and the covariances fitted for its winner and for the pose refined from it."""
+    """A trained network, and the covariances fitted for its winner, for that as a start, and for the refined pose."""
 
     model: VIOLearner
     covariance: CovarianceModel
+    start_covariance: CovarianceModel
     refined_covariance: CovarianceModel
+
+    def as_start(self) -> Weights:
+        """The network as it runs where its estimate will be refined: levels are taken less often."""
+        model = copy(self.model)
+        model.config = replace(model.config, passes=model.config.starting_passes)
+        return replace(self, model=model, covariance=self.start_covariance)
 
 
 def save(path: Path, weights: Weights, training: dict[str, Any]) -> None:
@@ -31,8 +40,7 @@ def save(path: Path, weights: Weights, training: dict[str, Any]) -> None:
         "format": FORMAT,
         "config": asdict(weights.model.config),
         "state": {name: value.detach().cpu().clone() for name, value in weights.model.state_dict().items()},
-        "covariance": weights.covariance.to_dict(),
-        "refined_covariance": weights.refined_covariance.to_dict(),
+        **{name: getattr(weights, name).to_dict() for name in COVARIANCES},
         "training": training,
     }
     partial = path.with_suffix(".partial")
@@ -57,6 +65,4 @@ def load(path: Path | None = None) -> Weights:
         raise LogError(f"{path}: not a weights file of format {FORMAT}")
     model = VIOLearner(NetworkConfig(**content["config"]))
     model.load_state_dict(content["state"])
-    return Weights(
-        model.eval(), CovarianceModel(**content["covariance"]), CovarianceModel(**content["refined_covariance"])
-    )
+    return Weights(model.eval(), **{name: CovarianceModel(**content[name]) for name in COVARIANCES})

@@ -105,5 +105,5 @@ def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
         height=SIZE[1], width=SIZE[0], trunk_filters=4, extra_filters=4, imu_filters=(4, 4, 4, 4, 4, 4, 4)
     )
     path = tmp_path_factory.mktemp("weights") / "small.pt"
-    weights.save(path, weights.Weights(VIOLearner(config), CovarianceModel(), CovarianceModel()), {})
+    weights.save(path, weights.Weights(VIOLearner(config), CovarianceModel(), CovarianceModel(), CovarianceModel()), {})
     return path
