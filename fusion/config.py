@@ -90,7 +90,8 @@ class FusionConfig(Section):
     per sqrt(Hz)). *_bias_sigma (rad/s, m/s^2): how far they are from what the calibration found.
 
     Errors of a front end are correlated in time: beside the covariance of each pair estimate it has a scale error
-    (pair_scale_sigma; learned_pair_scale_sigma where the network made the pairs, whose scale is that of the depth) and
+    (pair_scale_sigma; learned_pair_scale_sigma where the network made the pairs, whose scale is that of the depth; of a
+    log that is long enough the pose graph finds out how large it is, and takes this for a first guess) and
     a rate bias (pair_rate_bias_sigma and learned_pair_rate_bias_sigma, rad/s) that change over *_correlation_s, and a
     constant misalignment of its rotations against its translations (pair_misalignment_sigma, rad).
 

@@ -27,6 +27,7 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
+from fusion import front_end
 from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import PoseGraphConfig
 from fusion.drift import Closures, Odometry, Pose
@@ -40,7 +41,6 @@ from fusion.posegraph import (
     KNOT_S,
     REJECTED_WEIGHT,
     check,
-    front_end_walk,
     preintegrate,
     preintegration,
 )
@@ -280,7 +280,7 @@ class Smoother:
         self._knots.append(knot + 1)
         self._begins.append(self._latest)
         self._values.insert(S(knot + 1), self._values.atVector(S(knot)))
-        self._factors.append(front_end_walk(knot, dt, config.front_end_sigma(self._steps[:1]), config))
+        self._factors.append(front_end.walk(knot, dt, config.front_end_sigma(self._steps[:1]), config))
         if self._calibration is not None:
             self._values.insert(B(knot + 1), self._values.atConstantBias(B(knot)))
             walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3) * np.sqrt(dt)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion import gnss, marginals, outliers
+from fusion import front_end, gnss, marginals, outliers
 from fusion.chain import ImuWindow, ImuWindows, chain, mean_rates, motions_of
 from fusion.config import PoseGraphConfig, Robust
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
@@ -49,6 +49,7 @@ MAX_CONTRADICTED = 0.2  # share of the pairs: where more seem to be wrong, it is
 # Median, over so many steps, of the squared errors of IMU factors; rough roads have up to 5.5 and 2.6.
 MAX_IMU_SQUARES = {51: 9.0, 301: 3.2}
 KNOT_S = 1.0  # between states of the front end
+LEAST_CORRELATION_TIMES = 3.0  # of the front end's scale error; over less of it the log tells no more than is assumed
 MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance is singular but for rounding
 
 MAX_ITERATIONS = 30
@@ -61,13 +62,13 @@ REJECTED_WEIGHT = 1e-4  # of a step whose pair is left out: no more than a hint,
 Tree = TypeVar("Tree")  # what elimination makes of a graph
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Problem:
     """A graph, where its solution is looked for from, and those of its factors that are evaluated together.
 
     The first factor holds X(0) still. T_camera_imu (4, 4): what E(0) strays from. twists (K, 6): of the IMU at the
     stamps of the poses, or None where the poses are those of the camera. knots (K,): the front end's state at each
-    stamp.
+    stamp. front_end_sigmas: of its scale error and rate bias; front_end_rows: the factors between its states.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -77,6 +78,13 @@ class Problem:
     twists: FloatArray | None
     knots: IntArray
     batches: list[Batch] = field(default_factory=list)
+    front_end_sigmas: tuple[float, float] = (0.0, 0.0)
+    front_end_rows: range = range(0)
+
+    @property
+    def between_knots_s(self) -> FloatArray:
+        """Seconds (J - 1,) from each state of the front end to the next."""
+        return np.asarray(np.diff(self.stamps_ns[_first(self.knots)]) / NANOSECONDS)
 
     @property
     def tied_up(self) -> bool:
@@ -145,7 +153,8 @@ def _solve(
     begin = np.searchsorted(problem.stamps_ns, [skip.source_stamp_ns for skip in measurements.skips])
     skips = _add_pairs(problem, measurements.skips, problem.knots[begin])
     loops = _add_pairs(problem, measurements.loops, NO_KNOT)
-    _add_front_end(problem, config.front_end_sigma(steps), config)
+    problem.front_end_sigmas = config.front_end_sigma(steps)
+    _add_front_end(problem, config)
     tie, without_gnss = gnss.tie(problem, measurements.gnss)
     solution = minimise(problem, config)
 
@@ -157,7 +166,14 @@ def _solve(
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
-        _note(windows, without_imu, len(measurements.skips), len(rejected), loops_used)
+        _note(
+            windows,
+            without_imu,
+            _scale_told(problem, steps, config),
+            len(measurements.skips),
+            len(rejected),
+            loops_used,
+        )
         + gnss.note(measurements.gnss, georeference, without_gnss),
         len(rejected) + int(wrong.imu.sum()) + sum(int(np.sum(each.weights < 0.5)) for each in others),
         series_of(problem, solution, pairs),
@@ -407,32 +423,14 @@ def _add_pairs(problem: Problem, pairs: Sequence[PairEstimate], knots: IntArray 
     return factors
 
 
-def _add_front_end(problem: Problem, front_end_sigma: tuple[float, float], config: PoseGraphConfig) -> None:
+def _add_front_end(problem: Problem, config: PoseGraphConfig) -> None:
     """The lasting errors of the front end, one state a knot."""
-    sigma = np.repeat(front_end_sigma, [1, 3])
-    first = _first(problem.knots)
-    seconds = np.diff(problem.stamps_ns[first]) / NANOSECONDS
-    for j in range(len(first)):
-        problem.values.insert(S(j), np.zeros(4))
-    problem.graph.add(gtsam.PriorFactorVector(S(0), np.zeros(4), _diagonal(sigma)))
-    for j, dt in enumerate(seconds):
-        problem.graph.add(front_end_walk(j, dt, front_end_sigma, config))
-
-
-def front_end_walk(knot: int, dt: float, sigmas: tuple[float, float], config: PoseGraphConfig) -> gtsam.NonlinearFactor:
-    """From one state of the front end to the next after dt seconds they fade and wander: a Gauss-Markov process.
-
-    sigmas: of scale error and rate bias (rad/s), as long as nothing is known of them.
-    """
-    sigma = np.repeat(sigmas, [1, 3])
-    keep = np.exp(-dt / np.repeat([config.pair_scale_correlation_s, config.pair_rate_bias_correlation_s], [1, 3]))
-    whitener = np.diag(1.0 / (sigma * np.sqrt(1.0 - keep**2)))
-    unit = gtsam.noiseModel.Unit.Create(4)
-    linear = gtsam.JacobianFactor(S(knot), -whitener * keep, S(knot + 1), whitener, np.zeros(4), unit)
-    point = gtsam.Values()
-    point.insert(S(knot), np.zeros(4))
-    point.insert(S(knot + 1), np.zeros(4))
-    return gtsam.LinearContainerFactor(linear, point)
+    for knot in range(problem.knots[-1] + 1):
+        problem.values.insert(S(knot), np.zeros(4))
+    start = problem.graph.size()
+    for factor in front_end.process(problem.between_knots_s, problem.front_end_sigmas, config):
+        problem.graph.add(factor)
+    problem.front_end_rows = range(start, problem.graph.size())
 
 
 def _diagonal(sigmas: FloatArray) -> gtsam.noiseModel.Diagonal:
@@ -448,7 +446,7 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
     judged = [batch for batch in problem.batches if batch.judged]
     gates = [chi2.isf(config.gate_probability, batch.dimension) for batch in judged]
     order = elimination_order(problem)
-    values, width = problem.values, np.inf
+    values, width, scale_known = problem.values, np.inf, not _shows_scale(problem, config)
     for iteration in range(MAX_ITERATIONS):
         for batch in problem.batches:
             batch.update(values)
@@ -460,9 +458,12 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
         linear = problem.graph.linearize(values)
         step = _eliminated(linear.eliminateMultifrontal, order, problem.tied_up).optimize()
         lowered = 2.0 * (linear.error(values.zeroVectors()) - linear.error(step))
-        values = values.retract(step)
+        point, values = values, values.retract(step)
         if iteration >= FORGIVING_ITERATIONS and width <= 1.0 and lowered < CONVERGED:
-            break
+            if scale_known:
+                break
+            _renew_scale(problem, point, linear, order, config)
+            scale_known = True
     if not np.all(np.isfinite(poses_of(values))):
         raise RuntimeError("the solution is not finite")
     _make_first_camera_the_world(problem, values)
@@ -484,6 +485,45 @@ def _renew_velocities(problem: Problem, values: gtsam.Values) -> None:
     if problem.twists is not None:
         velocities = gtsam.utilities.extractVectors(values, "v")
         problem.twists[:, 3:] = np.einsum("nji,nj->ni", poses_of(values)[:, :3, :3], velocities)
+
+
+def _shows_scale(problem: Problem, config: PoseGraphConfig) -> bool:
+    """Whether how large scale errors are can be told: an IMU shows them, and they have had the time to change."""
+    seconds = (problem.stamps_ns[-1] - problem.stamps_ns[0]) / NANOSECONDS
+    return problem.twists is not None and seconds > LEAST_CORRELATION_TIMES * config.pair_scale_correlation_s
+
+
+def _renew_scale(
+    problem: Problem,
+    point: gtsam.Values,
+    linear: gtsam.GaussianFactorGraph,
+    order: gtsam.Ordering,
+    config: PoseGraphConfig,
+) -> None:
+    """Take the size of the front end's scale errors from the log; linear: the problem at a point near its solution."""
+    assumed, rate = problem.front_end_sigmas
+
+    def process(factor: float) -> list[gtsam.NonlinearFactor]:
+        return front_end.process(problem.between_knots_s, (factor * assumed, rate), config)
+
+    def linear_process(factor: float) -> gtsam.GaussianFactorGraph:
+        return _graph([each.linearize(point) for each in process(factor)])
+
+    def eliminate(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesNet:
+        return _eliminated(graph.eliminateSequential, order, problem.tied_up)
+
+    others = _graph([linear.at(row) for row in range(linear.size()) if row not in problem.front_end_rows])
+    factor = front_end.likely_scale(others, linear_process, eliminate)
+    problem.front_end_sigmas = factor * assumed, rate
+    for row, each in zip(problem.front_end_rows, process(factor), strict=True):
+        problem.graph.replace(row, each)
+
+
+def _graph(factors: Sequence[gtsam.GaussianFactor]) -> gtsam.GaussianFactorGraph:
+    graph = gtsam.GaussianFactorGraph()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph
 
 
 def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> None:
@@ -620,9 +660,16 @@ def _std_at(problem: Problem, solution: Solution, symbol: Callable[[int], int]) 
     return np.sqrt([np.diag(solution.covariances[symbol(j)]) for j in knots])[problem.knots]
 
 
+def _scale_told(problem: Problem, steps: Sequence[PairEstimate], config: PoseGraphConfig) -> str:
+    """How large the front end's scale errors are, where the log has told it."""
+    told, assumed = problem.front_end_sigmas[0], config.front_end_sigma(steps)[0]
+    return "" if told == assumed else f"; scale errors of {100 * told:.2g} %"
+
+
 def _note(
     windows: Sequence[ImuWindow | None],
     without_imu: str,
+    scale_told: str,
     skips: int,
     pairs_rejected: int,
     loops_used: NDArray[np.bool_],
@@ -632,4 +679,4 @@ def _note(
     skipping = f"; {counted(skips, 'pair that skips a frame', 'pairs that skip a frame')}" if skips else ""
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
-    return imu + skipping + rejected + loops
+    return imu + scale_told + skipping + rejected + loops
