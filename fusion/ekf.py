@@ -628,7 +628,8 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
         calibration = None
     still = standing_still(steps, windows, np.zeros(3) if calibration is None else calibration.gyro_bias)
     first_twist = steps[0].T_source_target.as_exp_coords() / steps[0].duration_s
-    ekf = Filter(config, calibration, measurements.mounting, config.front_end_sigma(steps), first_twist)
+    front_end_sigma = measurements.front_end_sigma or config.front_end_sigma(steps)
+    ekf = Filter(config, calibration, measurements.mounting, front_end_sigma, first_twist)
     gate = chi2.isf(config.gate_probability, 6)
     stamps_ns = stamps_of(steps)
     closures = Closures(measurements.loops, stamps_ns, config.gate_probability)

@@ -66,7 +66,8 @@ def between_steps(pairs: Sequence[PairEstimate], steps: Sequence[PairEstimate]) 
 def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str, Estimate]:
     """What the back ends that are asked for make of the measurements; one that fails is counted and left out.
 
-    What is causal takes the mounting as the pose graph has refined it, and no IMU that the pose graph had to leave out.
+    What is causal takes mounting and size of the front end's errors as the pose graph has found them, and no IMU that
+    the pose graph had to leave out.
     """
     asked = back_ends(config)
     estimates: dict[str, Estimate] = {}
@@ -74,7 +75,9 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
     graph = _attempt("posegraph", known, config, of_graph) if "posegraph" in asked or known.imu else None
     if graph is not None and "posegraph" in asked:
         estimates["posegraph"] = graph
-    refined = replace(known, mounting=graph.mounting if graph else None)
+    refined = known
+    if graph is not None:
+        refined = replace(known, mounting=graph.mounting, front_end_sigma=graph.front_end_sigma)
     if graph is not None and graph.mounting is None:
         refined = replace(known, imu=None, calibration=None)
     for name in asked[1:] if "posegraph" in asked else asked:

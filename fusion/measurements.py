@@ -65,8 +65,9 @@ class Measurements:
 
     steps: pair estimates that follow each other without holes (`chain.bridge_gaps`). imu: samples in the IMU's own axes
     on the camera's clock, without what is faulty, and calibration: what is known of how they relate to the camera; both
-    None where there is no IMU to be used. mounting: the same where a back end has refined it. skips: pair estimates
-    between frames of the same steps that are further apart. loops: the same between frames where the camera came back.
+    None where there is no IMU to be used. mounting: the same where a back end has refined it. front_end_sigma: of the
+    front end's scale error and rate bias (rad/s), where a back end has found out how large they are. skips: estimates
+    of pairs of frames of the same steps that are further apart. loops: the same between frames where the camera came back.
     gnss: positions of an antenna.
     """
 
@@ -74,6 +75,7 @@ class Measurements:
     imu: ImuSeries | None = None
     calibration: ImuCalibration | None = None
     mounting: Mounting | None = None
+    front_end_sigma: tuple[float, float] | None = None
     skips: Sequence[PairEstimate] = ()
     loops: Sequence[PairEstimate] = ()
     gnss: Positions | None = None
@@ -85,9 +87,9 @@ class Estimate:
 
     trajectory: with the covariance of every pose. note: one line on how the measurements were used. rejected: how many
     of them were left out as outliers. series: what was estimated beside the poses. loops_used (M,): which of the loops
-    were believed; empty for a back end that takes none. mounting: as it was refined. georeference: where on the earth
-    the world is, where positions told it. hindsight: of a causal back end, the trajectory where its last instant sees
-    it, where loops moved what was before them.
+    were believed; empty for a back end that takes none. mounting: as it was refined. front_end_sigma: as in
+    `Measurements`. georeference: where on the earth the world is, where positions told it. hindsight: of a causal back
+    end, the trajectory where its last instant sees it, where loops moved what was before them.
     """
 
     trajectory: Trajectory
@@ -96,5 +98,6 @@ class Estimate:
     series: EstimatorSeries | None = None
     loops_used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     mounting: Mounting | None = None
+    front_end_sigma: tuple[float, float] | None = None
     georeference: Georeference | None = None
     hindsight: Trajectory | None = None

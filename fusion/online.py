@@ -7,10 +7,11 @@ trajectory, the odometry, drifts. The map of keyframes of `fusion.drift` holds h
 corrects all keyframes, and the present through the last of them. A full iSAM2 would have to eliminate the way back to
 the loop anew.
 
-The pose of frame k depends on measurements until k only, given how the IMU is mounted, what its clock reads and the
-gyro's first bias. Those come from the whole log (`fusion.imu.calibrate`, and refined by `posegraph.solve` where the
-measurements have that): they stand for what a robot knows from its drives before. What else was decided over the whole
-log is not undone either: which stretches of the IMU are faulty, and how holes between pairs are bridged.
+The pose of frame k depends on measurements until k only, given how the IMU is mounted, what its clock reads, the gyro's
+first bias and how large the front end's errors are. Those come from the whole log (`fusion.imu.calibrate`, and found
+or refined by `posegraph.solve` where the measurements have that): they stand for what a robot knows from its drives
+before. What else was decided over the whole log is not undone either: which stretches of the IMU are faulty, and how
+holes between pairs are bridged.
 """
 
 from __future__ import annotations
@@ -126,6 +127,7 @@ class Smoother:
         self._config = config
         self._parameters = preintegration(config)
         self._steps = measurements.steps
+        self._front_end_sigma = measurements.front_end_sigma or config.front_end_sigma(self._steps[:1])
         self._seconds = (stamps_of(self._steps) - self._steps[0].source_stamp_ns) / NANOSECONDS
         motions = motions_of(self._steps)
         self._motions = np.asarray(motions.as_matrix())
@@ -207,7 +209,7 @@ class Smoother:
         by_pair = self._by_pairs[step, :3]
         by_gyro = gtsam.Rot3.Logmap(measured.preintegrated.deltaRij()) / seconds
         of_pair = np.trace(self._steps[step].covariance[:3, :3]) / 3 / seconds**2
-        variance = of_pair + self._config.front_end_sigma(self._steps[:1])[1] ** 2
+        variance = of_pair + self._front_end_sigma[1] ** 2
         if np.sum((by_pair - by_gyro) ** 2) <= self._gate * variance:
             return False, False
         gyro_away, pair_away = (np.linalg.norm(rate - self._twist[:3]) for rate in (by_gyro, by_pair))
@@ -218,7 +220,7 @@ class Smoother:
         config, calibration = self._config, self._calibration
         self._values.insert(X(0), gtsam.Pose3(self._T_camera_imu))
         self._values.insert(S(0), np.zeros(4))
-        front_end = np.repeat(config.front_end_sigma(self._steps[:1]), [1, 3])
+        front_end = np.repeat(self._front_end_sigma, [1, 3])
         self._factors.append(gtsam.PriorFactorVector(S(0), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(front_end)))
         if calibration is None:
             fixed = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE_SIGMA)
@@ -280,7 +282,7 @@ class Smoother:
         self._knots.append(knot + 1)
         self._begins.append(self._latest)
         self._values.insert(S(knot + 1), self._values.atVector(S(knot)))
-        self._factors.append(front_end.walk(knot, dt, config.front_end_sigma(self._steps[:1]), config))
+        self._factors.append(front_end.walk(knot, dt, self._front_end_sigma, config))
         if self._calibration is not None:
             self._values.insert(B(knot + 1), self._values.atConstantBias(B(knot)))
             walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3) * np.sqrt(dt)

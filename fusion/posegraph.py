@@ -68,7 +68,7 @@ class Problem:
 
     The first factor holds X(0) still. T_camera_imu (4, 4): what E(0) strays from. twists (K, 6): of the IMU at the
     stamps of the poses, or None where the poses are those of the camera. knots (K,): the front end's state at each
-    stamp. front_end_sigmas: of its scale error and rate bias; front_end_rows: the factors between its states.
+    stamp. front_end_sigma: of its scale error and rate bias; front_end_rows: the factors between its states.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -78,7 +78,7 @@ class Problem:
     twists: FloatArray | None
     knots: IntArray
     batches: list[Batch] = field(default_factory=list)
-    front_end_sigmas: tuple[float, float] = (0.0, 0.0)
+    front_end_sigma: tuple[float, float] = (0.0, 0.0)
     front_end_rows: range = range(0)
 
     @property
@@ -153,7 +153,7 @@ def _solve(
     begin = np.searchsorted(problem.stamps_ns, [skip.source_stamp_ns for skip in measurements.skips])
     skips = _add_pairs(problem, measurements.skips, problem.knots[begin])
     loops = _add_pairs(problem, measurements.loops, NO_KNOT)
-    problem.front_end_sigmas = config.front_end_sigma(steps)
+    problem.front_end_sigma = config.front_end_sigma(steps)
     _add_front_end(problem, config)
     tie, without_gnss = gnss.tie(problem, measurements.gnss)
     solution = minimise(problem, config)
@@ -163,13 +163,14 @@ def _solve(
     rejected = np.flatnonzero(pairs.weights < 0.5)
     loops_used = loops.weights >= 0.5
     georeference = tie.georeference(problem, solution) if tie else None
+    told = None if problem.front_end_sigma == config.front_end_sigma(steps) else problem.front_end_sigma
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
         _note(
             windows,
             without_imu,
-            _scale_told(problem, steps, config),
+            told,
             len(measurements.skips),
             len(rejected),
             loops_used,
@@ -179,6 +180,7 @@ def _solve(
         series_of(problem, solution, pairs),
         loops_used,
         _mounting(problem, solution),
+        told,
         georeference,
     )
 
@@ -428,7 +430,7 @@ def _add_front_end(problem: Problem, config: PoseGraphConfig) -> None:
     for knot in range(problem.knots[-1] + 1):
         problem.values.insert(S(knot), np.zeros(4))
     start = problem.graph.size()
-    for factor in front_end.process(problem.between_knots_s, problem.front_end_sigmas, config):
+    for factor in front_end.process(problem.between_knots_s, problem.front_end_sigma, config):
         problem.graph.add(factor)
     problem.front_end_rows = range(start, problem.graph.size())
 
@@ -501,7 +503,7 @@ def _renew_scale(
     config: PoseGraphConfig,
 ) -> None:
     """Take the size of the front end's scale errors from the log; linear: the problem at a point near its solution."""
-    assumed, rate = problem.front_end_sigmas
+    assumed, rate = problem.front_end_sigma
 
     def process(factor: float) -> list[gtsam.NonlinearFactor]:
         return front_end.process(problem.between_knots_s, (factor * assumed, rate), config)
@@ -514,7 +516,7 @@ def _renew_scale(
 
     others = _graph([linear.at(row) for row in range(linear.size()) if row not in problem.front_end_rows])
     factor = front_end.likely_scale(others, linear_process, eliminate)
-    problem.front_end_sigmas = factor * assumed, rate
+    problem.front_end_sigma = factor * assumed, rate
     for row, each in zip(problem.front_end_rows, process(factor), strict=True):
         problem.graph.replace(row, each)
 
@@ -660,16 +662,10 @@ def _std_at(problem: Problem, solution: Solution, symbol: Callable[[int], int]) 
     return np.sqrt([np.diag(solution.covariances[symbol(j)]) for j in knots])[problem.knots]
 
 
-def _scale_told(problem: Problem, steps: Sequence[PairEstimate], config: PoseGraphConfig) -> str:
-    """How large the front end's scale errors are, where the log has told it."""
-    told, assumed = problem.front_end_sigmas[0], config.front_end_sigma(steps)[0]
-    return "" if told == assumed else f"; scale errors of {100 * told:.2g} %"
-
-
 def _note(
     windows: Sequence[ImuWindow | None],
     without_imu: str,
-    scale_told: str,
+    front_end_told: tuple[float, float] | None,
     skips: int,
     pairs_rejected: int,
     loops_used: NDArray[np.bool_],
@@ -679,4 +675,5 @@ def _note(
     skipping = f"; {counted(skips, 'pair that skips a frame', 'pairs that skip a frame')}" if skips else ""
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
-    return imu + scale_told + skipping + rejected + loops
+    scale = f"; scale errors of {100 * front_end_told[0]:.2g} %" if front_end_told else ""
+    return imu + scale + skipping + rejected + loops

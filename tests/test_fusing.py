@@ -1,6 +1,7 @@
 """What run, replay and API share: what the back ends get, and that the failure of one does not end the other."""
 
 from dataclasses import replace
+from types import ModuleType
 from typing import Literal
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from benchmarks.drives import EKF, POSE_GRAPH, simulate
-from fusion import ekf, fusing, posegraph
+from fusion import ekf, fusing, online, posegraph
 from fusion.config import RunConfig
 from fusion.measurements import Measurements
 from fusion_io.errors import LogError
@@ -52,6 +53,22 @@ def test_the_filter_begins_with_the_mounting_of_the_pose_graph(
     assert given[0].mounting is not None
     assert_allclose(given[0].mounting.T_camera_imu, expected.T_camera_imu)
     assert_allclose(given[0].mounting.covariance, expected.covariance)
+
+
+@pytest.mark.parametrize(("name", "back_end"), [("ekf", ekf), ("posegraph_online", online)])
+def test_what_is_causal_is_told_how_large_the_errors_of_the_front_end_are(
+    name: str, back_end: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = replace(posegraph.solve(KNOWN, POSE_GRAPH), front_end_sigma=(0.07, 1e-3))
+    monkeypatch.setattr(posegraph, "solve", lambda *_: graph)
+    given: list[Measurements] = []
+    solve = back_end.solve
+    monkeypatch.setattr(back_end, "solve", lambda known, config: given.append(known) or solve(known, config))
+    told = fusing.fuse(KNOWN, CONFIG.model_copy(update={"online": True}), Findings())[name]
+    assert given[0].front_end_sigma == (0.07, 1e-3)
+    assumed = solve(replace(given[0], front_end_sigma=None), CONFIG.ekf if name == "ekf" else CONFIG.posegraph)
+    sigmas = [np.sqrt(np.trace(each.trajectory.covariances[-1, 3:, 3:])) for each in (told, assumed)]
+    assert sigmas[0] > 1.5 * sigmas[1]  # the way is as uncertain as its scale
 
 
 def test_the_filter_uses_no_imu_that_the_pose_graph_had_to_leave_out() -> None:
