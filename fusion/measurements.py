@@ -66,9 +66,9 @@ class Measurements:
     steps: pair estimates that follow each other without holes (`chain.bridge_gaps`). imu: samples in the IMU's own axes
     on the camera's clock, without what is faulty, and calibration: what is known of how they relate to the camera; both
     None where there is no IMU to be used. mounting: the same where a back end has refined it. front_end_sigma: of the
-    front end's scale error and rate bias (rad/s), where a back end has found out how large they are. skips: estimates
-    of pairs of frames of the same steps that are further apart. loops: the same between frames where the camera came back.
-    gnss: positions of an antenna.
+    front end's scale error and rate bias (rad/s), where a back end has found out how large they are. skips: pair
+    estimates between frames of the same steps that are further apart. loops: the same between frames where the camera
+    came back. gnss: positions of an antenna.
     """
 
     steps: Sequence[PairEstimate]
