@@ -617,9 +617,9 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     """Filter the steps, which follow each other, with the IMU where there is one.
 
     Steps that it did not measure from start to end are predicted by constant velocity and rate; without any that it
-    measured nothing is predicted, and the poses are those of the chain. Each pose is that of its own instant; what
-    loops tell of earlier ones is in `Estimate.hindsight`. Of the pairs that skip frames those over two steps are used,
-    where the IMU tells which of two that disagree is wrong; positions are not.
+    measured nothing is predicted, and without skips the poses are those of the chain. Each pose is that of its own
+    instant; what loops tell of earlier ones is in `Estimate.hindsight`. Of the pairs that skip frames those over two
+    steps are used; positions are not.
     """
     steps, calibration = measurements.steps, measurements.calibration
     samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
@@ -635,7 +635,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     closures = Closures(measurements.loops, stamps_ns, config.gate_probability)
     rows, cameras = [_row(ekf, np.full(6, np.nan), np.nan, True)], [Pose(np.eye(4), np.zeros((6, 6)))]
     in_a_row = 0
-    skips = _over_two_steps(measurements.skips, stamps_ns, windows)
+    skips = _over_two_steps(measurements.skips, stamps_ns)
     skips_rejected = 0
     for frame, (step, window, stands) in enumerate(zip(steps, windows, still, strict=True), 1):
         pair = _measurement(step, config)
@@ -647,7 +647,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
             innovation, nis, used = np.full(6, np.nan), np.nan, True
         else:
             innovation, nis, used, in_a_row = _measure(ekf, pair, window, gate, in_a_row)
-        if (skip := skips.get(frame)) is not None:
+        if not lost and (skip := skips.get(frame)) is not None:
             skips_rejected += not ekf.update_unless_outlier(_measurement(skip, config, since=1), gate)
         if stands and used:
             ekf.stand_still()
@@ -703,14 +703,11 @@ def _measurement(pair: PairEstimate, config: EkfConfig, since: int = 0) -> Measu
     return Measurement(pair.T_source_target.as_matrix(), covariance, pair.duration_s, since)
 
 
-def _over_two_steps(
-    skips: Sequence[PairEstimate], stamps_ns: IntArray, windows: Sequence[ImuWindow | None]
-) -> dict[int, PairEstimate]:
-    """The pairs that lead from the frame before the last one to a frame that the IMU predicts, by its number."""
+def _over_two_steps(skips: Sequence[PairEstimate], stamps_ns: IntArray) -> dict[int, PairEstimate]:
+    """The pairs that lead from the frame before the last one to a frame, by its number."""
     frames = {before: frame for frame, before in enumerate(stamps_ns.tolist()[:-2], 2)}
     found = ((frames.get(skip.source_stamp_ns), skip) for skip in skips)
-    whole = ((frame, skip) for frame, skip in found if frame and stamps_ns[frame] == skip.target_stamp_ns)
-    return {frame: skip for frame, skip in whole if windows[frame - 1] is not None}
+    return {frame: skip for frame, skip in found if frame and stamps_ns[frame] == skip.target_stamp_ns}
 
 
 def _during(stamps_ns: IntArray, step: PairEstimate) -> NDArray[np.bool_]:
