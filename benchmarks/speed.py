@@ -196,7 +196,8 @@ def lapped(model: VIOLearner, laps: Laps) -> Iterator[None]:
 
 
 def stages(log: Log, imu: ImuSeries, weights: Weights, pairs: int) -> dict[str, float]:
-    """Seconds a pair by stage, batches as in streaming but one stage after the other."""
+    """Seconds a pair by stage with refinement, batches as in streaming but one stage after the other."""
+    weights = weights.as_start()
     weights = replace(weights, model=for_inference(weights.model))
     frames = usable(log)
     laps = Laps()
