@@ -40,7 +40,7 @@ def process(seconds: FloatArray, sigmas: tuple[float, float], config: FusionConf
 
 
 def walk(knot: int, dt: float, sigmas: tuple[float, float], config: FusionConfig) -> gtsam.NonlinearFactor:
-    """From the state of one knot to the next, dt seconds later."""
+    """From the state of one knot to the next, dt seconds later; sigmas as in `process`."""
     keep = np.exp([-dt / config.pair_scale_correlation_s, *[-dt / config.pair_rate_bias_correlation_s] * 3])
     whitener = np.diag(1.0 / (np.array([sigmas[0], *[sigmas[1]] * 3]) * np.sqrt(1.0 - keep**2)))
     unit = gtsam.noiseModel.Unit.Create(4)
@@ -59,7 +59,7 @@ def likely_scale(
     """The factor by which scale errors are larger than is assumed: the mean, in its logarithm, over all that may be.
 
     others: all of a linear problem but the process; process_of: the process for a factor, a row for each state;
-    eliminate: makes a Bayes net of a problem.
+    eliminate: makes a Bayes net of a problem. Raises RuntimeError, as GTSAM does, where that cannot be told.
     """
 
     def log_evidence(factor: float) -> float:
@@ -73,7 +73,9 @@ def likely_scale(
 
     logs = np.log(FACTORS)
     fine = np.linspace(logs[0], logs[-1], FINE)
-    evidence = CubicSpline(logs, [log_evidence(factor) for factor in FACTORS.tolist()])(fine)
-    density = evidence - 0.5 * (fine / np.log(DOUBT)) ** 2
+    evidence = [log_evidence(factor) for factor in FACTORS.tolist()]
+    if not np.all(np.isfinite(evidence)):
+        raise RuntimeError("the evidence for the size of scale errors is not finite")
+    density = CubicSpline(logs, evidence)(fine) - 0.5 * (fine / np.log(DOUBT)) ** 2
     weights = np.exp(density - density.max())
     return float(np.exp(weights @ fine / weights.sum()))

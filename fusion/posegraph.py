@@ -167,14 +167,7 @@ def _solve(
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
-        _note(
-            windows,
-            without_imu,
-            told,
-            len(measurements.skips),
-            len(rejected),
-            loops_used,
-        )
+        _note(windows, without_imu, told, len(measurements.skips), len(rejected), loops_used)
         + gnss.note(measurements.gnss, georeference, without_gnss),
         len(rejected) + int(wrong.imu.sum()) + sum(int(np.sum(each.weights < 0.5)) for each in others),
         series_of(problem, solution, pairs),

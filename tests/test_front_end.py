@@ -98,6 +98,11 @@ def test_the_log_tells_that_scale_errors_are_larger_than_assumed(monkeypatch: py
     assert told < 0.6 * mean_square()
 
 
+def test_what_is_not_finite_is_refused_as_gtsam_does() -> None:
+    with pytest.raises(RuntimeError):
+        _likely(np.array([0.01, np.nan, 0.02]), np.ones(2))
+
+
 def test_a_short_log_leaves_what_is_assumed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scale errors have not changed yet: what they are tells nothing of what they may be."""
 
