@@ -127,7 +127,10 @@ class Smoother:
         self._config = config
         self._parameters = preintegration(config)
         self._steps = measurements.steps
-        self._front_end_sigma = measurements.front_end_sigma or config.front_end_sigma(self._steps[:1])
+        assumed = config.front_end_sigma(self._steps[:1])
+        told = measurements.front_end_sigma or assumed
+        # Larger scale errors are not let in: what never looks back takes wrong pairs for them, and jumps.
+        self._front_end_sigma = min(told[0], assumed[0]), told[1]
         self._seconds = (stamps_of(self._steps) - self._steps[0].source_stamp_ns) / NANOSECONDS
         motions = motions_of(self._steps)
         self._motions = np.asarray(motions.as_matrix())

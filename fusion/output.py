@@ -191,6 +191,7 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
     """The content of metrics.json; what could not be computed is None. Times in `timing` are seconds."""
     log, calibration = outcome.log, outcome.calibration
     total = sum(seconds.values())
+    told = (estimate.front_end_sigma for estimate in outcome.estimates.values())
     return {
         "schema": SCHEMA,
         "log": {
@@ -205,6 +206,7 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
         "trajectories": {name: _values(outcome, name) for name in outcome.metrics},
         "at_end": {name: _at_end(each) for name, each in outcome.trajectories.items()},
         "calibration": _calibration(calibration, placement(calibration, outcome.mounting)),
+        "front_end": {"scale_sigma": next((sigma[0] for sigma in told if sigma), None)},
         "gnss": None if outcome.georeference is None else _georeference(outcome.georeference),
         "timing": {**seconds, "total": total, "realtime_factor": outcome.duration_s / total},
     }

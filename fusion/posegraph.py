@@ -668,5 +668,5 @@ def _note(
     skipping = f"; {counted(skips, 'pair that skips a frame', 'pairs that skip a frame')}" if skips else ""
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
-    scale = f"; scale errors of {100 * front_end_told[0]:.2g} %" if front_end_told else ""
+    scale = f"; the pairs' scale errors have a sigma of {100 * front_end_told[0]:.2g} %" if front_end_told else ""
     return imu + scale + skipping + rejected + loops

@@ -115,7 +115,7 @@ def test_a_run_leaves_these_files_and_no_others(tmp_path: Path, outcome: output.
 def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.Outcome) -> None:
     output.write_metrics(tmp_path, outcome, SECONDS)
     document = json.loads((tmp_path / "metrics.json").read_text())
-    assert document.keys() == {"schema", "log", "trajectories", "at_end", "calibration", "gnss", "timing"}
+    assert document.keys() == {"schema", "log", "trajectories", "at_end", "calibration", "front_end", "gnss", "timing"}
     assert document["schema"] == 1
     assert document["log"] == {
         "path": str(outcome.log.path),
