@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
+from threadpoolctl import threadpool_limits
 
 from fusion import online, posegraph
 from fusion.config import PoseGraphConfig
@@ -102,6 +103,7 @@ def main() -> None:
     parser.add_argument("--batch", action="store_true", help="the batch solution too")
     arguments = parser.parse_args()
     known, truth = simulate(arguments.poses, arguments.loops)
+    threadpool_limits(1, "blas")  # as in `fusion.fusing`
 
     table = Table(
         title=f"{arguments.poses} poses, {IMU_HZ:.0f} Hz IMU, {arguments.loops} loops, {os.cpu_count()} cores"

@@ -22,6 +22,7 @@ from results_page import COLUMNS, Check, Path2d, Section, Table, write_page
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
+from threadpoolctl import threadpool_limits
 
 from fusion import chain, ekf, fusing, posegraph
 from fusion import run as main_job
@@ -306,10 +307,11 @@ def timing(place: Place) -> Section:
     loops = revisits(truth, np.arange(len(truth)), rng)
     chosen = np.sort(rng.choice(len(loops), min(MANY_LOOPS, len(loops)), replace=False))
     known = replace(known, loops=[loops[i] for i in chosen])
-    started = perf_counter()
-    posegraph.solve(known, DEFAULTS.posegraph)
-    between = perf_counter()
-    ekf.solve(known, DEFAULTS.ekf)
+    with threadpool_limits(1, "blas"):  # as in `fusion.fusing`
+        started = perf_counter()
+        posegraph.solve(known, DEFAULTS.posegraph)
+        between = perf_counter()
+        ekf.solve(known, DEFAULTS.ekf)
     seconds = {"posegraph": between - started, "ekf": perf_counter() - between}
     name = f"00, {len(truth)} poses, IMU of 100 Hz, {len(chosen)} loops"
     return Section("timing", "Time", [Check(name, "batch, s", None, seconds, {"posegraph": 2.0})])

@@ -16,7 +16,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.linalg.blas import dsyrk
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
@@ -26,7 +25,8 @@ from fusion_io.records import NANOSECONDS, FloatArray, IntArray, PairEstimate, T
 KEYFRAME_S = 2.0
 LOOP_KEYFRAME_S = 1.0  # where a loop arrives: what it tells of the way since the last keyframe stays with the next only
 ROOM = 32  # keyframes that the map grows by
-PENDING = 16  # loops whose corrections of the joint covariance are made all at once, in the time that one takes
+PENDING = 16  # loops whose corrections of the joint covariance are made together, in the time that one takes,
+FRAMES = 40  # during so many frames, so that none of them takes long
 
 
 class Pose(NamedTuple):
@@ -119,10 +119,13 @@ class Map:
         self._places = [_Place(0, np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)))]
         self._keyframes = [0]  # their frames
         self._drifts = np.tile(np.eye(4), (ROOM, 1, 1))
-        # The lower triangle of a joint covariance C, and rows A: that of the drifts is C - A'A.
-        self._covariance = np.zeros((6 * ROOM, 6 * ROOM), order="F")
-        self._told = np.zeros((6 * PENDING, 6 * ROOM))  # by the latest loops
-        self._pending = 0  # rows of it
+        # The lower triangle of a joint covariance C, in slabs of ROOM keyframes, and rows A: that of the drifts is
+        # C - A'A, but the first rows of C hold already what the first of A take away, which are being worked in.
+        self._slabs = [np.zeros((6 * ROOM, 6 * ROOM))]
+        self._told = np.zeros((12 * PENDING, 6 * ROOM))  # A, by the latest loops
+        self._pending = 0  # rows of it,
+        self._working = 0  # of these, rows that are being worked in,
+        self._worked = 0  # and the rows of C that hold them
         self._odometry_covariance = np.zeros((6, 6))  # of the last keyframe, when it was the latest frame
         self._latest_covariance = np.zeros((6, 6))
         self._closed = False
@@ -131,6 +134,11 @@ class Map:
     def last(self) -> int:
         """The frame of the last keyframe."""
         return self._keyframes[-1]
+
+    @property
+    def _size(self) -> int:
+        """Rows of the joint covariance."""
+        return 6 * len(self._keyframes)
 
     def move_to(self, odometry: Odometry) -> Pose:
         """The next frame."""
@@ -141,7 +149,9 @@ class Map:
         least = since @ joint @ since.T
         self._latest_covariance = odometry.joint[6:, 6:]
         grown = self._latest_covariance - back @ self._odometry_covariance @ back.T
-        own = _positive(least) + _positive(grown - least)  # an odometry may get surer; what drifted has drifted
+        # An odometry may get surer; what drifted has drifted.
+        own = _positive(np.stack([least, grown - least])).sum(axis=0)
+        self._work_in(-(-len(self._keyframes) // FRAMES))
         self._places.append(_Place(len(self._keyframes) - 1, odometry.T, own, self._latest_covariance))
         if not self._closed:
             return Pose(odometry.T, self._latest_covariance)
@@ -154,12 +164,12 @@ class Map:
         before, number = self._places[-1].keyframe, len(self._keyframes)
         if number == len(self._drifts):
             self._drifts = np.concatenate([self._drifts, np.tile(np.eye(4), (ROOM, 1, 1))])
-            self._covariance = np.asfortranarray(np.pad(self._covariance, (0, 6 * ROOM)))
+            self._slabs.append(np.zeros((6 * ROOM, 6 * (number + ROOM))))
             self._told = np.pad(self._told, ((0, 0), (0, 6 * ROOM)))
         here, there = _block(number), _block(before)
         rows = self._recorded(before)
-        self._covariance[here, : here.start] = rows[:, : here.start]
-        self._covariance[here, here] = rows[:, there] + own
+        self._lower(number)[:, : here.start] = rows[:, : here.start]
+        self._lower(number)[:, here] = rows[:, there] + own
         self._told[:, here] = self._told[:, there]
         self._drifts[number] = self._drifts[before]
         self._keyframes.append(len(self._places) - 1)
@@ -181,13 +191,10 @@ class Map:
         beyond, rows, row = (solve_triangular(root, each, lower=True) for each in (beyond, rows, with_latest.T))
         if beyond @ beyond > self._gate:
             return None
-        self._told[self._pending : self._pending + 6] = rows
-        self._pending += 6
-        if self._pending == len(self._told):
-            dsyrk(-1.0, self._told, beta=1.0, c=self._covariance, trans=True, lower=True, overwrite_c=True)
-            self._pending = 0
+        self._tell(rows)
         moved = RigidTransform.from_exp_coords((beyond @ rows).reshape(-1, 6))
-        self._drifts = np.asarray(moved.as_matrix()) @ self._drifts
+        drifts = self._drifts[: len(self._keyframes)]
+        drifts[:] = np.asarray(moved.as_matrix()) @ drifts
         self._closed = True
         return _seen(_exp(beyond @ row) @ T, of_latest - row.T @ row)
 
@@ -217,26 +224,61 @@ class Map:
         to_world = _adjoint(T)
         return T, to_world @ own @ to_world.T
 
+    def _tell(self, rows: FloatArray) -> None:
+        """Take from the joint covariance what a loop tells, rows (6, 6 N) of A."""
+        while self._pending == len(self._told):
+            self._work_in(ROOM)
+        self._told[self._pending : self._pending + 6, : self._size] = rows
+        self._pending += 6
+        if not self._working and self._pending >= 6 * PENDING:
+            self._working, self._worked = self._pending, 0
+
+    def _work_in(self, keyframes: int) -> None:
+        """Let the rows of up to so many more keyframes hold what the loops tell that are being worked in."""
+        if not self._working:
+            return
+        number, begin = divmod(self._worked, 6 * ROOM)
+        end = min(self._worked + 6 * keyframes, 6 * ROOM * (number + 1), self._size)
+        told = self._told[: self._working]
+        rows = self._slabs[number][begin : begin + end - self._worked, :end]
+        rows -= told[:, self._worked : end].T @ told[:, :end]
+        self._worked = end
+        if end == self._size:
+            self._told[: self._pending - self._working] = self._told[self._working : self._pending]
+            self._pending, self._working = self._pending - self._working, 0
+
     def _rows(self, number: int) -> FloatArray:
         """The covariances (6, 6 N) of a keyframe with all of them."""
-        told = self._told[: self._pending]
-        return self._recorded(number) - told[:, _block(number)].T @ told
+        here, rows = _block(number), self._recorded(number)
+        told = self._told[self._working : self._pending, : self._size]
+        rows -= told[:, here].T @ told
+        told = self._told[: self._working, : self._size]
+        first = 0 if here.start >= self._worked else self._worked  # of the keyframes whose covariance lacks them
+        rows[:, first:] -= told[:, here].T @ told[:, first:]
+        return rows
 
     def _recorded(self, number: int) -> FloatArray:
-        """The same before the pending loops."""
+        """The same as C holds them."""
         here = _block(number)
-        rows = np.hstack([self._covariance[here, : here.stop], self._covariance[here.stop :, here].T])
+        first = number // ROOM
+        below = np.concatenate([slab[:, here] for slab in self._slabs[first:]])
+        below = below[here.stop - 6 * ROOM * first : self._size - 6 * ROOM * first]
+        rows = np.hstack([self._lower(number)[:, : here.stop], below.T])
         own = np.tril(rows[:, here])
         rows[:, here] = own + np.tril(own, -1).T
         return rows
 
+    def _lower(self, number: int) -> FloatArray:
+        """The rows (6, M) of a keyframe in C, which end with those of its slab."""
+        return self._slabs[number // ROOM][_block(number % ROOM)]
+
     def _between(self, one: int, other: int) -> FloatArray:
         """The covariance (6, 6) of what two frames have from their keyframes."""
         earlier, later = sorted([self._places[one].keyframe, self._places[other].keyframe])
-        found = self._covariance[_block(later), _block(earlier)]
+        found = self._lower(later)[:, _block(earlier)]
         if earlier == later:
             found = np.tril(found) + np.tril(found, -1).T
-        told = self._told[: self._pending]
+        told = self._told[self._working if _block(later).start < self._worked else 0 : self._pending]
         found = found - told[:, _block(later)].T @ told[:, _block(earlier)]
         return np.asarray(found if self._places[one].keyframe == later else found.T)
 
@@ -260,9 +302,9 @@ def _adjoint(T: FloatArray) -> FloatArray:
 
 
 def _positive(matrix: FloatArray) -> FloatArray:
-    """The part of a symmetric matrix that is positive."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    """The part of symmetric matrices (..., N, N) that is positive."""
+    values, vectors = np.linalg.eigh((matrix + matrix.swapaxes(-1, -2)) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
 def _seen(T: FloatArray, on_the_left: FloatArray) -> Pose:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from fusion import chain, ekf, online, posegraph
 from fusion.config import RunConfig
@@ -93,7 +94,8 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
 def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findings) -> Estimate | None:
     """The estimate of a back end; None, and counted, where it fails: the others are not lost."""
     try:
-        estimate = _solve(name, known, config)
+        with threadpool_limits(1, "blas"):  # small matrices: threads would wait for each other most of the time
+            estimate = _solve(name, known, config)
         if not np.all(np.isfinite(estimate.trajectory.poses.as_matrix())):
             raise FloatingPointError("a pose is not finite")
     except (FusionError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:  # GTSAM raises RuntimeError

@@ -64,8 +64,8 @@ def predict(
     ahead_s: d. misalignment (3,): m. front_end (N, 4): s, then b. seconds (N,): dt. reference (N, 3): r,
     None for t_Z as it is now.
     """
-    camera_source, by_source, of_source = camera(source, T_camera_imu, twists[0], ahead_s)
-    camera_target, by_target, of_target = camera(target, T_camera_imu, twists[1], ahead_s)
+    both = camera(np.concatenate([source, target]), T_camera_imu, np.concatenate(twists), ahead_s)
+    (camera_source, camera_target), (by_source, by_target), (of_source, of_target) = (np.split(v, 2) for v in both)
     motion = inverse(camera_source) @ camera_target
     back = adjoint(inverse(motion))
 

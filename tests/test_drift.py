@@ -70,11 +70,13 @@ def test_a_loop_moves_what_is_between_its_ends_as_it_drifted() -> None:
 
 
 def test_how_many_loops_are_taken_together_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Corrections of the joint covariance wait for others: until then they are taken from what is read of it."""
+    """Corrections of the joint covariance wait for others, then for their turn; what is read of it has them."""
     loops = [_loop(80 - k, k, np.array([0.01, 0.02, 0.03])) for k in range(45, 81, 5)]
     outcomes = []
-    for pending in (1, 3, 100):
+    for pending, frames, room in ((1, 1, 32), (1, 3, 2), (3, 40, 2), (100, 1, 32)):
         monkeypatch.setattr(drift, "PENDING", pending)
+        monkeypatch.setattr(drift, "FRAMES", frames)
+        monkeypatch.setattr(drift, "ROOM", room)
         closures, causal = _walked(_errors(3), loops)
         assert closures.used.all()
         outcomes.append((causal, closures.hindsight()))
