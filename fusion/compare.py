@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Modules that bring numpy are imported by the function that needs them, so that --help answers at once.
 
-WIDTH = 100  # where nobody watches
+WIDTH = 120  # where nobody watches
 SAME_PERCENT = 0.005  # less is not seen in the table
 
 _MEASURES = {"t_rel_percent": "t_rel (%)", "r_rel_deg_per_100m": "r_rel (deg/100 m)"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from math import hypot
 from pathlib import Path
@@ -299,9 +299,19 @@ def _first_problem(error: ValidationError) -> str:
 
 
 def _suggestion(location: tuple[int | str, ...]) -> str:
-    """The nearest name that exists in the table where the unknown one stands."""
+    """Where the unknown name exists; else the nearest one that exists in the table where it stands."""
+    if elsewhere := [name for name in _names(RunConfig) if name.split(".")[-1] == location[-1]]:
+        return f"; did you mean {' or '.join(map(repr, elsewhere))}?"
     section: type[BaseModel] = RunConfig
     for part in location[:-1]:
         section = section.model_fields[str(part)].annotation  # type: ignore[assignment]  # only sections are nested
     near = get_close_matches(str(location[-1]), section.model_fields, n=1, cutoff=0.0)
     return f"; did you mean {'.'.join([*map(str, location[:-1]), near[0]])!r}?" if near else ""
+
+
+def _names(section: type[BaseModel]) -> Iterator[str]:
+    """All names of a table and of those in it, such as `posegraph.gyro_noise`."""
+    for name, field in section.model_fields.items():
+        yield name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from (f"{name}.{inner}" for inner in _names(field.annotation))

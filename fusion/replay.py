@@ -186,13 +186,14 @@ def replay(log: Log, settings: Settings, config: RunConfig) -> Replay:
 
 
 def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list[str]]:
-    """The trajectories, by name, of the recorded pairs and IMU; and in lines what became of the IMU and was amiss.
+    """The trajectories, by name, of the recorded pairs and IMU; and in lines what became of them and was amiss.
 
     Raises LogError for a log without recorded pairs.
     """
     from fusion import chain, fusing, gnss, imu
     from fusion.placement import imu_line
     from fusion.run import known_mounting
+    from fusion.table import HEADINGS
     from fusion_io.findings import Findings
 
     pairs, samples = log.pairs(), log.imu()
@@ -206,7 +207,8 @@ def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list
     known = replace(known, skips=skips, loops=log.loops(), gnss=positions)
     estimates = fusing.fuse(known, config, findings)
     trajectories = {"raw": chain.chain(known.steps)} | {name: each.trajectory for name, each in estimates.items()}
-    return trajectories, [imu_line(calibration, estimates.values()), *findings.notes]
+    of_back_ends = [f"{HEADINGS[name]}: {each.note}" for name, each in estimates.items()]
+    return trajectories, [imu_line(calibration, estimates.values()), *of_back_ends, *findings.notes]
 
 
 def recorded_result(log: Log) -> Result | None:

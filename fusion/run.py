@@ -269,19 +269,19 @@ def present(folder: Path, outcome: Outcome, presentation: Presentation) -> None:
 
 
 def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
-    """Print the table, what became of the IMU and where the results are."""
+    """Print the table, what it comes to, what became of the IMU and where the results are."""
     from rich.console import Console
 
     from fusion.placement import imu_line
-    from fusion.report.verdict import doubts
+    from fusion.report.verdict import doubts, judgement
     from fusion.table import HEADINGS, print_table
 
     log = outcome.log
     title = f"{log.path.name}: {counted(len(outcome.trajectories['raw']), 'frame')}, {outcome.duration_s:.1f} s"
     metrics = {name: asdict(each) for name, each in outcome.metrics.items()}
     print_table(Console(file=stream), title, outcome.trajectories, metrics)
-    for doubt in doubts(outcome.content):
-        print(f"{doubt[0].upper()}{doubt[1:]}.", file=stream)
+    for line in (*doubts(outcome.content), judgement(outcome.content)[0]):
+        print(f"{line[0].upper()}{line[1:]}.", file=stream)
     print(f"At the end, right, down and ahead of the start: {'; '.join(ends(outcome.trajectories))}", file=stream)
     for remark in (*log.remarks, *outcome.findings.remarks):
         print(remark, file=stream)

@@ -106,6 +106,7 @@ def test_only_the_back_ends_that_settings_concern_are_run(settings: dict[str, ob
     [
         ({"posegraph.gyro_nois": 1e-3}, "did you mean 'posegraph.gyro_noise'"),
         ({"posegraf.gyro_noise": 1e-3}, "did you mean 'posegraph'"),
+        ({"gyro_noise": 1e-3}, "did you mean 'posegraph.gyro_noise' or 'ekf.gyro_noise'"),
         ({"backend.x": 1}, "backend.x: backend is a value"),
         ({"ekf.gyro_noise": -1}, "ekf.gyro_noise"),
         ({"backend": "huber"}, "backend"),

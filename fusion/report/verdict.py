@@ -64,13 +64,10 @@ def label(name: str) -> str:
 
 
 def verdict(content: ReportContent) -> Verdict:
-    """What to know of the run: doubts first, then how good it is, where the camera was at the end, and what was found.
-
-    It is judged against the ground truth where there is one, else by how consistent it is.
-    """
+    """What to know of the run: doubts first, then how good it is, where the camera was at the end, and what was found."""
     faults = Counter(event.kind for event in content.events if event.is_fault)
     doubted = doubts(content)
-    accuracy, status = _accuracy(content) or _consistency(content)
+    quality, status = judgement(content)
     found = [_imu(content)]
     if faults:
         found.append(
@@ -78,7 +75,7 @@ def verdict(content: ReportContent) -> Verdict:
         )
     if content.warnings:
         found.append(counted(len(content.warnings), "warning"))
-    lines = (*doubted, accuracy, _end(content), "; ".join(found))
+    lines = (*doubted, quality, _end(content), "; ".join(found))
     if any(each.is_lost for each in content.extrapolations):
         status = "bad"
     elif status == "good" and (doubted or faults or content.warnings):
@@ -95,6 +92,11 @@ def doubts(content: ReportContent) -> list[str]:
     if content.damage:
         lines.append(_damage(content))
     return lines
+
+
+def judgement(content: ReportContent) -> tuple[str, Status]:
+    """How good and how sure it is: against the ground truth where there is one, else by how consistent it is."""
+    return _accuracy(content) or _consistency(content)
 
 
 def _damage(content: ReportContent) -> str:
