@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Modules that bring numpy are imported by the function that needs them, so that --help answers at once.
 
-WIDTH = 120  # where nobody watches
+WIDTH = 100  # where nobody watches
 SAME_PERCENT = 0.005  # less is not seen in the table
 
 _MEASURES = {"t_rel_percent": "t_rel (%)", "r_rel_deg_per_100m": "r_rel (deg/100 m)"}
@@ -115,7 +115,7 @@ def measures_table(compared: Comparison) -> Table:
 def differences_table(compared: Comparison) -> Table:
     """A row for every pair of trajectories: how much larger the errors of the second are, and whether that is noise."""
     table = _table("Differences, with their 95 % confidence intervals")
-    table.add_column("", no_wrap=True)
+    table.add_column("")  # names that are long wrap, and nothing is cut
     table.add_column("", no_wrap=True)
     table.add_column("mean", justify="right", no_wrap=True)
     table.add_column("interval", no_wrap=True)

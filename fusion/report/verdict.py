@@ -64,7 +64,7 @@ def label(name: str) -> str:
 
 
 def verdict(content: ReportContent) -> Verdict:
-    """What to know of the run: doubts first, then how good it is, where the camera was at the end, and what was found."""
+    """What to know of the run: doubts first, then how good it is, where the camera was at the end, what was found."""
     faults = Counter(event.kind for event in content.events if event.is_fault)
     doubted = doubts(content)
     quality, status = judgement(content)

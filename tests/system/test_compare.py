@@ -77,6 +77,7 @@ def test_the_table_names_who_is_better_and_where(folder: Path, capsys: pytest.Ca
     for words in ("a.posegraph - a.raw", "pose graph", "t_rel", "r_rel", "stretches"):
         assert words in text
     assert max(map(len, text.splitlines())) <= 100
+    assert "…" not in text
 
 
 def test_a_page_is_written(folder: Path, tmp_path: Path) -> None:
