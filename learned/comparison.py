@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -77,16 +76,16 @@ def compare(alone: Sequence[Inference], refined: Sequence[Inference], truth: Tra
     known = truth.covers(stamps[:, 0]) & truth.covers(stamps[:, 1])
     if not known.any():
         raise LogError(f"none of its {len(alone)} estimated pairs lies within the ground truth's stamps")
-    spanned = list(compress(alone, known))
-    polished = list(compress(refined, known))
+    both = [each for *each, spanned in zip(alone, refined, known, strict=True) if spanned]
+    networks, polished = zip(*both, strict=True)
     stamps = stamps[known]
     return Comparison(
         stamps_ns=stamps,
         truth=(truth.at(stamps[:, 0]).inv() * truth.at(stamps[:, 1])).as_matrix(),
-        levels=np.stack([i.levels for i in spanned]),
-        hypotheses=np.stack([hypothesis_matrices(i.network) for i in spanned]),
-        winners=np.array([i.network.winner for i in spanned]),
-        network=Estimates.of([i.network for i in spanned]),
+        levels=np.stack([i.levels for i in networks]),
+        hypotheses=np.stack([hypothesis_matrices(i.network) for i in networks]),
+        winners=np.array([i.network.winner for i in networks]),
+        network=Estimates.of([i.network for i in networks]),
         refined=Estimates.of([i.pair for i in polished]),
         was_refined=np.array([i.refined for i in polished]),
     )
