@@ -467,7 +467,7 @@ def _first_bias(calibration: ImuCalibration) -> gtsam.imuBias.ConstantBias:
 
 
 def _triangular(Ab: FloatArray) -> FloatArray:
-    """R (N, N) of a matrix (M, N) = Q R: by Cholesky in a third of the time, by QR where that fails.
+    """R (N, N) of a matrix (M, N) = Q R: by Cholesky in half the time, by QR where that fails.
 
     Steps and covariances then differ by less than a ten-thousandth of the standard deviations.
     """
