@@ -83,12 +83,21 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
         refined = replace(known, imu=None, calibration=None)
     for name in asked[1:] if "posegraph" in asked else asked:
         if estimate := _attempt(name, refined, config, findings):
-            estimates[name] = estimate
+            estimates[name] = replace(estimate, note=estimate.note + _by_the_graph(name, known, refined))
             if estimate.hindsight is not None:
                 estimates[f"{name}_smoothed"] = Estimate(
                     estimate.hindsight, "the EKF in hindsight: its loops move what was before them"
                 )
     return estimates
+
+
+def _by_the_graph(name: str, known: Measurements, refined: Measurements) -> str:
+    """What a back end took from the pose graph against what was known or set, to follow what else is said."""
+    if known.imu is not None and refined.imu is None:
+        return "; the pose graph had to leave the IMU out"
+    if name == "ekf" and refined.front_end_sigma is not None:
+        return f"; scale errors have a sigma of {100 * refined.front_end_sigma[0]:.2g} %, as the pose graph found"
+    return ""
 
 
 def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findings) -> Estimate | None:

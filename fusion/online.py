@@ -97,7 +97,9 @@ class Tracker:
     def note(self) -> str:
         """One line on how the measurements were used."""
         measured = self._smoother.inertial_steps
-        return (f"IMU on {measured} of {self._steps} steps" if measured else "pairs only") + self._closures.note
+        rejected = f"; rejected as outliers: {self._smoother.rejected}" if self._smoother.rejected else ""
+        used = f"IMU on {measured} of {self._steps} steps" if measured else "pairs only"
+        return used + rejected + self._closures.note
 
 
 # ------------------------------------------------------------------------------------------- the fixed-lag smoother

@@ -46,7 +46,8 @@ INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece b
 RATE_SPANS_S = (0.03, 0.06, 0.1)  # to each side of a frame: so long a carrier turns at one rate, nearly
 MIN_WINDOWS = 20
 MAX_CONTRADICTED = 0.2  # share of the pairs: where more seem to be wrong, it is the IMU that is
-# Median, over so many steps, of the squared errors of IMU factors; rough roads have up to 5.5 and 2.6.
+# Median, over so many steps, of the squared errors of IMU factors; rough roads have up to 5.5 and 2.6. Where a log is
+# shorter, what lies between by the logarithm.
 MAX_IMU_SQUARES = {51: 9.0, 301: 3.2}
 KNOT_S = 1.0  # between states of the front end
 LEAST_CORRELATION_TIMES = 3.0  # of the front end's scale error; over less of it the log tells no more than is assumed
@@ -167,7 +168,7 @@ def _solve(
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
-        _note(windows, without_imu, told, len(measurements.skips), len(rejected), loops_used)
+        _note(windows, without_imu, told, skips.weights < 0.5, len(rejected), loops_used)
         + gnss.note(measurements.gnss, georeference, without_gnss),
         len(rejected) + int(wrong.imu.sum()) + sum(int(np.sum(each.weights < 0.5)) for each in others),
         series_of(problem, solution, pairs),
@@ -187,11 +188,18 @@ def _refuse_contradiction(
     factors = (graph.at(i) for i in range(graph.size()))
     inertial = [each for each in factors if isinstance(each, gtsam.ImuFactorWithGravityDirection)]
     squares = np.array([2.0 * each.error(values) for each in inertial])
-    for steps, most in MAX_IMU_SQUARES.items():
-        stretches = np.lib.stride_tricks.sliding_window_view(squares, min(steps, len(squares)))
+    for steps in sorted({min(steps, len(squares)) for steps in MAX_IMU_SQUARES}):
+        most = _accepted(steps)
+        stretches = np.lib.stride_tricks.sliding_window_view(squares, steps)
         worst = np.max(np.median(stretches, axis=1))
         if worst > most:
-            raise RuntimeError(f"the IMU is {np.sqrt(worst):.1f} standard deviations off the motion for {steps} frames")
+            off = f"{np.sqrt(worst):.1f} standard deviations off the motion, where {np.sqrt(most):.1f} are accepted"
+            raise RuntimeError(f"the IMU is {off}, for {steps} frames")
+
+
+def _accepted(steps: int) -> float:
+    """The largest median, over so many steps, of the squared errors of IMU factors."""
+    return float(np.interp(np.log(steps), np.log([*MAX_IMU_SQUARES]), [*MAX_IMU_SQUARES.values()]))
 
 
 def check(pairs: Sequence[PairEstimate]) -> None:
@@ -659,13 +667,15 @@ def _note(
     windows: Sequence[ImuWindow | None],
     without_imu: str,
     front_end_told: tuple[float, float] | None,
-    skips: int,
+    skips_rejected: NDArray[np.bool_],
     pairs_rejected: int,
     loops_used: NDArray[np.bool_],
 ) -> str:
     measured = sum(window is not None for window in windows)
     imu = f"pairs only: {without_imu}" if not measured else f"IMU on {measured} of {len(windows)} steps"
+    skips = len(skips_rejected)
     skipping = f"; {counted(skips, 'pair that skips a frame', 'pairs that skip a frame')}" if skips else ""
+    skipping += f", {skips_rejected.sum()} of them rejected" if np.any(skips_rejected) else ""
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
     scale = f"; the pairs' scale errors have a sigma of {100 * front_end_told[0]:.2g} %" if front_end_told else ""

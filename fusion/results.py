@@ -84,9 +84,11 @@ def read_results(
 
 def log_file(path: Path) -> Path:
     """The log of a run's folder; any other path as it is. Raises LogError for one that does not exist."""
+    trajectories = sorted(each.name for each in path.glob("*.tum")) if path.is_dir() else []
     path = path / LOG_NAME if path.is_dir() else path
     if not path.exists():
-        raise LogError(f"{path}: no such file")
+        instead = f"; beside it are {', '.join(trajectories)}: give one of them" if trajectories else ""
+        raise LogError(f"{path}: no such file{instead}")
     return path
 
 

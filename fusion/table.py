@@ -73,7 +73,7 @@ def print_table(
             table.add_row(row.label, Text(row.unit), *_cells(row, values))
     table.add_section()
     table.add_row("path length", "m", *(number(each.path_length_m, 1) for each in trajectories.values()))
-    table.add_row("stated 1-sigma at the end", "m", *(final_sigma(each) for each in trajectories.values()))
+    table.add_row("stated sigma at the end", "m", *(final_sigma(each) for each in trajectories.values()))
     console.print(Text(title))
     console.print(table)
     console.print(Text(_legend(metrics)))

@@ -218,6 +218,13 @@ def test_an_input_that_cannot_be_used_is_an_error_in_one_line(
     assert reason in line
 
 
+def test_a_folder_without_a_log_says_what_can_be_compared_in_its_place(tmp_path: Path) -> None:
+    """As what a replay writes has none."""
+    write_tum(tmp_path / "posegraph.tum", TRUTH)
+    with pytest.raises(LogError, match=r"run\.mcap: no such file; beside it are posegraph\.tum: give one of them"):
+        read_results([tmp_path])
+
+
 def test_a_log_without_trajectories_is_an_error(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "input.mcap") as log:
         log.ground_truth(TRUTH)

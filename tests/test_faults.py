@@ -3,6 +3,7 @@
 The bound of every fault: fused ATE, by either back end, is at most 1.05 times that of the raw chain of the same pairs.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -14,7 +15,7 @@ import pytest
 from fault_samples import Log
 from numpy.testing import assert_allclose
 
-from fusion import events, fusing
+from fusion import events, fusing, posegraph
 from fusion.chain import chain
 from fusion.config import RunConfig
 from fusion.evaluation import evaluate
@@ -201,6 +202,22 @@ def test_an_accelerometer_that_contradicts_the_motion_is_seen_by_the_graph() -> 
     assert result.calibration.used
     assert "no solution" in result.estimates["posegraph"].note
     assert "no IMU" in result.estimates["ekf"].note
+
+
+def test_a_short_log_may_be_as_rough_as_a_stretch_of_its_length() -> None:
+    """The fewer steps, the further their median may be off; where a log ends, nobody counts on."""
+    accepted = [posegraph._accepted(steps) for steps in (20, 51, 100, 200, 301, 1000)]
+    assert accepted == sorted(accepted, reverse=True)
+    assert accepted[:2] == [9.0, 9.0]
+    assert accepted[4:] == [3.2, 3.2]
+    result = _fused(_drive())
+    seen = re.search(r"IMU on (\d+) of", result.estimates["posegraph"].note)
+    assert seen is not None
+    contradicted = replace(_drive(), imu=faults.accelerometer_bias_step(_drive().imu, AT_S, np.array([3.0, 3.0, 0.0])))
+    said = re.search(r"where (\S+) are accepted, for (\d+) frames", _fused(contradicted).estimates["posegraph"].note)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(np.sqrt(posegraph._accepted(int(said[2]))), abs=0.05)
+    assert int(said[2]) <= int(seen[1])
 
 
 REAL_FAULTS: dict[str, Callable[[ImuSeries], ImuSeries]] = {

@@ -84,7 +84,7 @@ def test_the_filter_uses_no_imu_that_the_pose_graph_had_to_leave_out() -> None:
     )
     estimates = fusing.fuse(replace(KNOWN, imu=short), CONFIG, Findings())
     assert estimates["posegraph"].note.startswith("pairs only: the IMU measured")
-    assert estimates["ekf"].note == "pairs only: no IMU"
+    assert estimates["ekf"].note == "pairs only: no IMU; the pose graph had to leave the IMU out"
 
 
 def test_who_asked_for_the_filter_alone_is_told_nothing_of_the_pose_graph(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,7 @@ def test_path_and_stated_uncertainty_need_no_ground_truth(name: str) -> None:
     assert "No ground truth" in text
     assert "t_rel" not in text
     assert next(line for line in text.splitlines() if "path length" in line).split()[-1] == "7.0"
-    assert next(line for line in text.splitlines() if "1-sigma" in line).split()[-1] == "1.73"
+    assert next(line for line in text.splitlines() if "stated sigma" in line).split()[-1] == "1.73"
 
 
 def test_a_log_shorter_than_a_segment_says_so() -> None:

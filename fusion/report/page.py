@@ -244,7 +244,7 @@ def _metrics(content: ReportContent) -> str:
         )
     for what, unit, cell in (
         ("path length", "m", lambda each: number(each.path_length_m, 1)),
-        ("stated 1-sigma at the end", "m", final_sigma),
+        ("stated sigma at the end", "m", final_sigma),
     ):
         cells = [f"<td>{escape(cell(content.trajectories[name]))}</td>" for name in names]
         body.append(f"<tr><th scope=row>{what} <small>{unit}</small></th>{''.join(cells)}</tr>")

@@ -222,6 +222,6 @@ def _agreement(names: tuple[str, str], first: Trajectory, second: Trajectory) ->
 
 
 def _compared(value: float, other: float) -> str:
-    if abs(value - other) < 0.01 * other:
+    if abs(value - other) < 0.01 * other or metres(value) == metres(other):
         return "the same as"
     return "better than" if value < other else "worse than"
