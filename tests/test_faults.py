@@ -205,7 +205,7 @@ def test_an_accelerometer_that_contradicts_the_motion_is_seen_by_the_graph() -> 
 
 
 def test_a_short_log_may_be_as_rough_as_a_stretch_of_its_length() -> None:
-    """The fewer steps, the further their median may be off; where a log ends, nobody counts on."""
+    """What is accepted falls with the number of steps, of which there are no more than the IMU was used on."""
     accepted = [posegraph._accepted(steps) for steps in (20, 51, 100, 200, 301, 1000)]
     assert accepted == sorted(accepted, reverse=True)
     assert accepted[:2] == [9.0, 9.0]
