@@ -159,7 +159,7 @@ def test_losers_learn_a_little_in_relaxed_winner_take_all(model: VIOLearner) -> 
 def test_bias_penalty_is_the_l1_norm_of_the_biases(model: VIOLearner) -> None:
     estimate = model(random_batch(SMALL))
     biases = sum(float(p.detach().abs().sum()) for n, p in model.named_parameters() if n.endswith("bias"))
-    difference = float(loss(estimate, model, 1e-2) - loss(estimate, model, 0.0))
+    difference = (loss(estimate, model, 1e-2) - loss(estimate, model, 0.0)).item()
     assert difference == pytest.approx(1e-2 * biases, rel=1e-3)
 
 
