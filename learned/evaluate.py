@@ -269,7 +269,7 @@ def baseline_table(figures: Mapping[str, Any]) -> Table:
             f" The refined and the classical estimates are {agreement['apart_translation_m']:.4f} m and "
             f"{1e3 * agreement['apart_rotation_rad']:.2f} mrad apart; {agreement['shared_translation_m']:.4f} m and "
             f"{1e3 * agreement['shared_rotation_rad']:.2f} mrad of their errors are common to both, and so those of "
-            "ground truth or calibration."
+            "ground truth, calibration or time stamps."
         )
     return table
 

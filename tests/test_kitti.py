@@ -2,6 +2,7 @@
 
 import functools
 import operator
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io.errors import LogError, UsageError
 from fusion_io.gnss import Receiver
-from fusion_io.kitti import open_odometry, open_raw, read_imu_mat, read_timestamps
+from fusion_io.kitti import open_odometry, open_raw, read_imu_mat, read_timestamps, trigger_times
 from fusion_io.trajectory_files import read_times
 
 K = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
@@ -485,6 +486,51 @@ def test_lines_that_are_no_time_stamp_are_refused(tmp_path, line):
         read_timestamps(path)
 
 
+def write_stamps(drive: Path, camera: int, late_ms: list[float]) -> None:
+    """Stamps of a camera's images, each so much later than the trigger."""
+    late_ns = (1e6 * np.array(late_ms)).astype(int)
+    lines = [f"2011-09-26 14:05:36.{16_685_824 + 100_000_000 * i + late_ns[i]:09d}" for i in range(len(late_ms))]
+    (drive / f"image_{camera:02d}" / "timestamps.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_a_frame_has_the_earliest_stamp_of_its_images(drive):
+    """Which camera's stamps are late changes from frame to frame; where both are, the earlier is nearer."""
+    write_stamps(drive, 0, [0, 6, 0.3, 0, 2, 0])
+    write_stamps(drive, 1, [4, 0, 0, 0, 1, 0])
+    recording = open_raw(drive)
+    late_ns = np.array([frame.stamp_ns for frame in recording.frames]) - 1_317_045_936_016_685_824
+    assert_array_equal(late_ns - 100_000_000 * np.arange(FRAMES), [0, 0, 0, 0, 1_000_000, 0])
+    assert not recording.warnings
+
+
+@pytest.mark.parametrize("late_ms", [[80, 4, 4, 4, 4, -60], [4, 4, 4, 4]], ids=["outliers", "fewer"])
+def test_stamps_that_no_other_camera_bears_out_are_kept(drive, late_ms):
+    write_stamps(drive, 1, late_ms)
+    recording = open_raw(drive)
+    assert [frame.stamp_ns - 1_317_045_936_016_685_824 for frame in recording.frames] == [
+        100_000_000 * i for i in range(FRAMES)
+    ]
+    assert not recording.warnings
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (timestamps(0).replace("14:05", "14:04"), "not of the same frames"),
+        ("soon\n", "line 1: not a date and time"),
+        ("", "holds no data"),
+    ],
+)
+def test_a_camera_whose_stamps_are_of_no_use_is_left_out_and_counted(drive, text, reason):
+    (drive / "image_01" / "timestamps.txt").write_text(text)
+    recording = open_raw(drive)
+    assert next(iter(recording.frames)).stamp_ns == 1_317_045_936_016_685_824
+    [(warning, count)] = recording.warnings.items()
+    assert "image_01/timestamps.txt" in warning
+    assert reason in warning
+    assert count == 1
+
+
 def test_a_drive_has_frames_imu_and_gnss_at_their_own_stamps(drive):
     recording = open_raw(drive, gnss=Receiver(1e-3, noise_m=1e-6))
     frames = list(recording.frames)
@@ -655,6 +701,21 @@ def test_the_real_drive_with_its_two_missing_images(shared_data):
     v = np.arange(300, 370)
     road = frames[0].depth[300:370, 560:660] * ((v - 172.854) / 721.5377)[:, None]
     assert_allclose(np.median(road[road > 0]), 1.65, atol=0.15)
+
+
+def test_the_cameras_of_the_real_drive_are_triggered_evenly(shared_data):
+    """Intervals change slowly between triggers: by far less than either camera's own stamps say."""
+    drive = shared_data / "kitti" / "raw" / "2011_09_26" / "2011_09_26_drive_0039_sync"
+    times = {camera: read_timestamps(drive / camera / "timestamps.txt") for camera in ("image_00", "image_01")}
+    warnings: Counter[str] = Counter()
+    triggers = trigger_times(drive, "image_00", warnings)
+    assert not warnings
+    assert_array_equal(triggers, trigger_times(drive, "image_01", warnings))
+
+    def unevenness_ms(stamps_ns):
+        return np.std(np.diff(stamps_ns, 2)) * 1e-6
+
+    assert unevenness_ms(triggers) < 0.25 * min(map(unevenness_ms, times.values()))
 
 
 def test_the_steps_of_the_real_ground_truth_are_those_of_a_car(shared_data):

@@ -9,6 +9,10 @@ the left grey camera, 1 the right one; 2 and 3 are the colour cameras. Both pair
 the stereo pair or from the Velodyne scanner, whose scan i was taken around frame i: the cameras are triggered when
 it looks forward. The odometry benchmark's scans are compensated for the car's motion, those of the raw drives are
 not: what is at the margins of the image was measured up to 12 ms earlier or later than the image was taken.
+
+All cameras are triggered at once, but each image of a raw drive was stamped by itself when the computer had it: up to
+7 ms late, now this camera's, now that one's, never early. The earliest stamp of a frame is its time (see
+``trigger_times``).
 """
 
 from __future__ import annotations
@@ -81,7 +85,8 @@ RAW_DRIVES = {
     "09": ("2011_09_30_drive_0033", 0),
     "10": ("2011_09_30_drive_0034", 0),
 }
-#: A synchronised OXTS record is within 10 ms of its frame; further than this (median) the frames are others.
+#: A synchronised OXTS record is within 10 ms of its frame; further than this (median) the frames are others. Stamps
+#: of one frame's images are within 7 ms.
 CLOCK_TOLERANCE_NS = 20_000_000
 
 
@@ -260,7 +265,7 @@ def open_raw(
     stereo, or from the scanner where there are scans but no right camera. gnss: a receiver
     that sees the unit's positions. They are not ground truth for what is computed from them, so there is none then;
     otherwise it keeps the stamps of the OXTS records, and is that of the chosen left camera in the
-    frame of its first pose.
+    frame of its first pose. Frames have the times of ``trigger_times``.
     """
     calibration = drive.absolute().parent if calibration is None else calibration
     if not drive.is_dir():
@@ -268,10 +273,9 @@ def open_raw(
     cameras = _chosen_cameras(drive, "image_{:02d}", colour)
     left, right = (drive / f"image_{camera:02d}" for camera in cameras)
     scans = drive / "velodyne_points" / "data"
+    recording = Recording()
     times = left / "timestamps.txt"
-    stamps_ns = read_timestamps(times)
-    if not (np.diff(stamps_ns) > 0).all():
-        raise LogError(f"{times}: the times do not increase")
+    stamps_ns = trigger_times(drive, left.name, recording.warnings)
     cam_to_cam = calibration / "calib_cam_to_cam.txt"
     matrices = read_calibration(cam_to_cam)
     names = [f"P_rect_{camera:02d}" for camera in cameras]
@@ -286,7 +290,7 @@ def open_raw(
         else LidarRig(_K(cam_to_cam, matrices, names[0]), T_camera_velodyne)
     )
 
-    recording = Recording(rotation_imu_camera=T_camera_imu.rotation.inv())
+    recording.rotation_imu_camera = T_camera_imu.rotation.inv()
     others = right / "data" if source == "stereo" else scans
     files = _on_disk(stamps_ns, left / "data", others, _indices(stamps_ns, frames, times), recording.warnings)
     width, height = _matrix(cam_to_cam, matrices, f"S_rect_{cameras[0]:02d}", (2,)).astype(int).tolist()
@@ -303,6 +307,33 @@ def open_raw(
     else:
         recording.gnss = gnss.fixes(oxts.gnss())
     return recording
+
+
+def trigger_times(drive: Path, camera: str, warnings: Counter[str]) -> IntArray:
+    """When the frames of a raw drive were taken (N,): of each the earliest of its images' time stamps.
+
+    camera: the folder whose frames they are, ``image_00``. Of the other cameras a stamp that is further than
+    ``CLOCK_TOLERANCE_NS`` from its own is of another frame; a camera most of whose stamps are, or whose stamps cannot
+    be read, is left out and counted. Of one camera its own stamps are all there is.
+    """
+    times = drive / camera / "timestamps.txt"
+    own_ns = read_timestamps(times)
+    earliest_ns = own_ns.copy()
+    for other in sorted(set(drive.glob("image_*/timestamps.txt")) - {times}):
+        try:
+            other_ns = read_timestamps(other)[: len(own_ns)]
+        except LogError as error:
+            _count(warnings, f"time stamps of another camera left out ({error})", 1)
+            continue
+        near = np.abs(other_ns - own_ns[: len(other_ns)]) < CLOCK_TOLERANCE_NS
+        if 2 * np.count_nonzero(near) <= len(near):
+            _count(warnings, f"time stamps of another camera left out ({other}: not of the same frames)", 1)
+            continue
+        frames = np.flatnonzero(near)
+        earliest_ns[frames] = np.minimum(earliest_ns[frames], other_ns[frames])
+    if not (np.diff(earliest_ns) > 0).all():
+        raise LogError(f"{times}: the times do not increase")
+    return earliest_ns
 
 
 _TIMESTAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
