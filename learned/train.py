@@ -50,7 +50,7 @@ class Recipe:
     validate_every: int = 250
     imu_dropout: float = 0.1
     calibration_clips: int = 128
-    refined_calibration_clips: int = 64
+    refined_calibration_clips: int = 256
 
     def descent(self) -> Descent:
         """The part of it that the optimiser needs."""
@@ -322,7 +322,7 @@ def draw_training_curve(out: Path) -> None:
 
 
 def calibrate(model: VIOLearner, pairs: PairSet, refined_clips: int, device: str) -> tuple[Weights, dict[str, float]]:
-    """Fit the covariances on one half of held-out simulation; the network's weights, and the figures on the other half.
+    """Fit the covariances on held-out simulation; the network's weights, and figures on what was not fitted to.
 
     Those of the network's winner are fitted on pairs with and without their IMU, that of the refined pose on clips at
     full resolution.
