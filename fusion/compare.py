@@ -32,7 +32,7 @@ _COLUMNS = (
     ("r_rel_deg_per_100m", "r_rel", "deg/100m", 3, 1.0),
     ("ate_m", "ATE", "m", 2, 1.0),
     ("end_error_m", "end", "m", 2, 1.0),
-    ("rpe_translation_m", "RPE", "cm", 2, 1e2),
+    ("rpe_translation_m", "RPE", "m", 4, 1.0),
     ("rpe_rotation_rad", "RPE", "mrad", 2, 1e3),
     ("anees_position", "ANEES", "position", 1, 1.0),
     ("anees_orientation", "ANEES", "orient.", 1, 1.0),
