@@ -219,6 +219,18 @@ def shown_jacobian(state: State, shown: Prediction, since: int) -> FloatArray:
     return H
 
 
+def world_jacobian(state: State, since: int) -> FloatArray:
+    """(43, 6): how all poses err with one of the clones where it is the world that errs: attitude, position."""
+    N = np.zeros((DIMENSION, 6))
+    first = state.clones[since]
+    places = zip((ATTITUDE, *CLONE_ATTITUDE), (POSITION, *CLONE_POSITION), strict=True)
+    for (attitude, position), T in zip(places, (state.pose, *state.clones), strict=True):
+        N[attitude, :3] = T[:3, :3].T @ first[:3, :3]
+        N[position, :3] = -skew(T[:3, 3] - first[:3, 3]) @ first[:3, :3]
+        N[position, 3:] = np.eye(3)
+    return N
+
+
 def inject(state: State, error: FloatArray) -> State:
     """The state with an error (43,) moved into it."""
     clones = [
@@ -278,6 +290,8 @@ class Filter:
         sigma = np.zeros(DIMENSION)
         sigma[VELOCITY] = config.velocity_sigma
         sigma[GRAVITY_DIRECTION] = config.gravity_sigma
+        self.has_imu = calibration is not None
+        self.guessed = False
         if calibration is None:
             self.unknown = ANY_MOTION
         else:
@@ -341,6 +355,7 @@ class Filter:
 
     def predict(self, window: ImuWindow | None, seconds: float) -> None:
         """Move on to the next frame: by what an IMU measured, or else by constant velocity and rate."""
+        self.guessed = window is None
         if window is not None:
             self._predict_by_imu(window)
         else:
@@ -355,18 +370,23 @@ class Filter:
         return innovation, float(innovation @ np.linalg.solve(H @ self.kf.P @ H.T + measured.covariance, innovation))
 
     def update(self, measured: Measurement) -> None:
-        """Correct by a measurement since a clone (Joseph form), move the error into the state and reset it."""
-        shown = self.state.shown(measured)
-        H = shown_jacobian(self.state, shown, measured.since)
-        before = self.kf.P
-        self.kf.update(
-            measured.motion,
-            HJacobian=lambda _: H,
-            Hx=lambda _: shown.motion,
-            R=measured.covariance,
-            residual=lambda motion, prediction: difference(prediction, motion[None])[0],
-        )
-        self._consider(before, H, measured.covariance)
+        """Correct by a measurement since a clone (Joseph form), move the error into the state and reset it.
+
+        Where no IMU predicted the motion the Jacobian is that of where the measurement leaves the state (Bell and
+        Cathey, "The iterated Kalman filter update as a Gauss-Newton method", 1993): that of a guess that is off by some
+        degrees would tie the present pose to the clones by the wrong motion, and the next measurement would take that
+        for an error of the world. What an IMU predicts is better than a pair, whose noise the Jacobian is spared.
+        """
+        before, error = self.kf.P, np.zeros(DIMENSION)
+        for _ in range(2 if self.guessed else 1):
+            at = inject(self.state, error)
+            shown = at.shown(measured)
+            H = shown_jacobian(at, shown, measured.since) @ reset_jacobian(error)
+            innovation = difference(shown.motion, measured.motion[None])[0] + H @ error
+            self.kf.x, self.kf.P = np.zeros(DIMENSION), before
+            self.kf.update(innovation, HJacobian=lambda _, H=H: H, Hx=lambda _: np.zeros(6), R=measured.covariance)
+            self._consider(before, H, measured)
+            error = self.kf.x
         self._move_error(H)
 
     def update_unless_outlier(self, measured: Measurement, gate: float) -> bool:
@@ -388,16 +408,25 @@ class Filter:
         )
         self._move_error(H)
 
-    def _consider(self, before: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        """Take back what an update by H and R did to what is only considered; before: the covariance until then.
+    def _consider(self, before: FloatArray, H: FloatArray, measured: Measurement) -> None:
+        """Take back what an update by H did to what is only considered; before: the covariance until then.
 
         Without those rows the gain is not the best one, and the covariance follows by Joseph's form, good for any.
+
+        Without an IMU a pair tells nothing of the world, and so nothing of the clone that it begins at, nor of the
+        lasting errors of its own front end. What the gain has of them is of the linearisation, times how uncertain the
+        world is by now (Huang, Mourikis, Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
+        estimators", 2010): all poses are moved back, so that the clone stays.
         """
         gain = self.kf.K.copy()
         gain[CONSIDERED] = 0.0
+        if not self.has_imu:
+            clone = np.r_[CLONE_ATTITUDE[measured.since], CLONE_POSITION[measured.since]]
+            gain[FRONT_END] = 0.0
+            gain = gain - world_jacobian(self.state, measured.since) @ gain[clone]
         keep = np.eye(DIMENSION) - gain @ H
         self.kf.K, self.kf.x = gain, gain @ self.kf.y
-        self.kf.P = keep @ before @ keep.T + gain @ R @ gain.T
+        self.kf.P = keep @ before @ keep.T + gain @ measured.covariance @ gain.T
 
     def _move_error(self, H: FloatArray) -> None:
         """After an update by H (M, 43): move the error into the state, and reset it."""

@@ -15,7 +15,17 @@ from scipy.stats import chi2
 from benchmarks.drives import EKF, PAIR_SIGMA, Drive, simulate
 from fusion import ekf
 from fusion.chain import ImuWindow, chain, motions_of
-from fusion.ekf import DIMENSION, Filter, Measurement, State, inject, propagate, reset_jacobian, shown_jacobian
+from fusion.ekf import (
+    DIMENSION,
+    Filter,
+    Measurement,
+    State,
+    inject,
+    propagate,
+    reset_jacobian,
+    shown_jacobian,
+    world_jacobian,
+)
 from fusion.evaluation import pose_errors
 from fusion.imu import ImuCalibration
 from fusion.measurements import Estimate, Measurements, Mounting
@@ -159,6 +169,21 @@ def test_no_measurement_feels_a_turn_of_the_world(velocity: float) -> None:
         shown = moved.shown(Measurement(np.eye(4), np.eye(6), 0.1, since))
         assert_allclose(shown_jacobian(moved, shown, since) @ _turn_of_the_world(moved), 0.0, atol=1e-10)
     assert not np.any(_turn_of_the_world(state)[ekf.VELOCITY])
+
+
+@pytest.mark.parametrize("since", [0, 1])
+def test_errors_of_the_world_move_all_poses_alike(since: int) -> None:
+    """One of the clones by what is asked for, the others with it, so that no pair feels it."""
+    state = _random_state(np.random.default_rng(6))
+    errors = world_jacobian(state, since)
+    clone = np.r_[ekf.CLONE_ATTITUDE[since], ekf.CLONE_POSITION[since]]
+    assert_allclose(errors[clone], np.eye(6), atol=1e-12)
+    for error in STEP * errors.T:
+        ends = [inject(state, sign * error) for sign in (1, -1)]
+        of_world = [end.pose @ np.linalg.inv(state.pose) for end in ends]
+        for k in (0, 1):
+            moved = [end.clones[k] @ np.linalg.inv(state.clones[k]) for end in ends]
+            assert_allclose((moved[0] - moved[1]) / (2 * STEP), (of_world[0] - of_world[1]) / (2 * STEP), atol=1e-8)
 
 
 @pytest.mark.parametrize("size", [0.2, 1e-5])
@@ -544,6 +569,21 @@ def test_without_an_imu_pairs_that_skip_a_frame_are_what_a_trajectory_is_better_
     assert np.sum(np.square(filtered)) < 0.8 * np.sum(np.square(chained))
     low, high = chi2.ppf([0.005, 0.995], 3 * len(squares))
     assert low < np.sum(squares) < high
+
+
+def test_without_an_imu_motions_do_not_depend_on_how_uncertain_the_world_is() -> None:
+    """The last motions of a drive of two minutes are those of a filter that begins a few seconds before its end."""
+    drive = simulate(0, 120.0, EKF, skipping=True)
+    steps = drive.measurements.steps[-50:]
+    began = steps[0].source_stamp_ns
+    late = Measurements(steps, skips=[each for each in drive.measurements.skips if each.source_stamp_ns >= began])
+
+    def motions(known: Measurements) -> FloatArray:
+        poses = ekf.solve(known, EKF).trajectory.poses[-40:]
+        return np.asarray((poses[:-1].inv() * poses[1:]).as_matrix())
+
+    off = np.abs(difference(motions(_without_imu(drive)), motions(late))) / PAIR_SIGMA
+    assert np.max(off) < 0.05
 
 
 def test_a_hole_in_the_imu_is_crossed_by_the_pairs() -> None:
