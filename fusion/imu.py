@@ -24,8 +24,9 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import binary_closing, binary_opening, find_objects, label
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
+from scipy.special import expit
 from scipy.stats import f as f_distribution
-from scipy.stats import rankdata
+from scipy.stats import multivariate_normal, multivariate_t, rankdata
 
 from fusion import clocks, sensors
 from fusion.chain import MAX_IMU_PERIODS
@@ -59,6 +60,20 @@ MAX_BIAS_STEPS = 3
 STEP_BATCH_S = 5.0  # as long as errors of pairs are correlated
 STEP_MIN_PAIRS = 20  # on either side
 STEP_MIN_BATCHES = 5
+STEP_CHANCE = 1e-6
+STEP_MIN = 8e-3  # rad/s: below, the drift of a front end can look like it
+
+# Where gyro and pairs disagree for long, the gyro is at fault too: front ends fail for single pairs, but an IMU that
+# saturates or loses its clock does so for a while.
+CONTRADICTION = 8.0  # standard deviations
+CONTRADICTION_PAIRS = 6  # at least so many in a row
+CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
+
+# A gyro that a navigation system has corrected has hardly a bias, and knowing that is worth more than the pairs; a bare
+# one has a large bias, which only the pairs can tell. Which of them it is shows in whether what the pairs see can be
+# chance and their own drift, where they would see the biases of bare gyros sharply.
+BARE_GYRO_BIAS = 1e-2  # rad/s
+BATCHES = 5
 STEP_CHANCE = 1e-6
 STEP_MIN = 8e-3  # rad/s: below, the drift of a front end can look like it
 
@@ -105,7 +120,7 @@ class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
 
     rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
-    gyro_bias (3,) rad/s in IMU axes, zero for a gyro that seems to have been corrected already. used, reason: the
+    gyro_bias (3,) rad/s in IMU axes, near zero for a gyro that seems to have been corrected. used, reason: the
     verdict and what led to it. Standard deviations, zero for what was given or is taken to be zero: rotation_std_rad
     (3,) about the camera's axes, time_offset_std_s, gyro_bias_std (rad/s) of each component. faulty_ns (M, 2):
     intervals on the IMU's clock in which the gyro was not measured, or contradicts the pairs for long. changes: where
@@ -484,20 +499,23 @@ def _refine(gyro: _Gyro, turns: _Turns, rotation: Rotation | None, offset_s: flo
 
 
 def _gyro_bias(fit: _Fit) -> tuple[FloatArray, float]:
-    """The gyro's bias (3,) in IMU axes and its standard deviation, or zeros for a gyro without one.
+    """The gyro's bias (3,) in IMU axes and its standard deviation: of a bare gyro and of one without a bias.
 
-    The deviation of a mean of correlated errors follows from the scatter of the means of batches (Law and Carson,
-    "A sequential procedure for determining the length of a steady-state simulation", 1979).
+    Mean and deviation of the mixture of both, with even chances beforehand: near zero where what the pairs show can be
+    chance, and where that is open, uncertain by as much as it is large. How uncertain a mean of correlated errors is
+    follows from the scatter of the means of batches (Law and Carson, "A sequential procedure for determining the length
+    of a steady-state simulation", 1979).
     """
     weight = 1.0 / (1.0 + (fit.deviation / CAUCHY) ** 2)
     errors = (fit.turns.turned - fit.predicted) / (fit.turns.target_s - fit.turns.source_s)[:, None]
     batches = zip(np.array_split(errors, BATCHES), np.array_split(weight, BATCHES), strict=True)
     means = [np.average(values, axis=0, weights=weights) for values, weights in batches]
     variance = float(np.mean(np.var(means, axis=0, ddof=1))) / BATCHES + PAIR_DRIFT**2
-    highest = 3.0 * variance * f_distribution.isf(CHANCE, 3, 3 * (BATCHES - 1))
-    if variance < (SHARP * BARE_GYRO_BIAS) ** 2 and fit.gyro_bias @ fit.gyro_bias < highest:
-        return np.zeros(3), 0.0
-    return fit.gyro_bias, float(np.sqrt(variance))
+    squared = fit.gyro_bias @ fit.gyro_bias
+    by_chance = multivariate_t(np.zeros(3), variance * np.eye(3), df=3 * (BATCHES - 1)).logpdf(fit.gyro_bias)
+    if_bare = multivariate_normal(np.zeros(3), (variance + BARE_GYRO_BIAS**2) * np.eye(3)).logpdf(fit.gyro_bias)
+    bare = float(expit(if_bare - by_chance))
+    return bare * fit.gyro_bias, float(np.sqrt(bare * variance + bare * (1.0 - bare) * squared / 3.0))
 
 
 def _without_bias_steps(
