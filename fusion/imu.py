@@ -73,22 +73,6 @@ CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
 # one has a large bias, which only the pairs can tell. Which of them it is shows in whether what the pairs see can be
 # chance and their own drift, where they would see the biases of bare gyros sharply.
 BARE_GYRO_BIAS = 1e-2  # rad/s
-BATCHES = 5
-STEP_CHANCE = 1e-6
-STEP_MIN = 8e-3  # rad/s: below, the drift of a front end can look like it
-
-# Where gyro and pairs disagree for long, the gyro is at fault too: front ends fail for single pairs, but an IMU that
-# saturates or loses its clock does so for a while.
-CONTRADICTION = 8.0  # standard deviations
-CONTRADICTION_PAIRS = 6  # at least so many in a row
-CONTRADICTION_PAUSE = 10  # fewer than so many pairs of agreement do not end it
-
-# A gyro that a navigation system has corrected has hardly a bias, and knowing that is worth more than the pairs; a bare
-# one has a large bias, which only the pairs can tell. It is taken for the first where the pairs would see the biases of
-# bare gyros sharply, and yet show a difference that can be chance and their own drift.
-BARE_GYRO_BIAS = 1e-2  # rad/s
-SHARP = 0.1  # of it
-CHANCE = 2e-3
 BATCHES = 5  # whose scatter shows how uncertain the mean of errors is that are correlated in time
 PAIR_DRIFT = 3e-4  # rad/s: constant over a log, so that no scatter shows it
 

@@ -263,7 +263,7 @@ def _calibration(content: ReportContent) -> str:
             rows.append(("refined from", _moved(known, content.mounting)))
         bias = ", ".join(f"{1e3 * part:.3f}" for part in known.gyro_bias)
         estimated = f"{bias} mrad/s, sigma {1e3 * known.gyro_bias_std:.3f}"
-        rows.append(("gyro bias x, y, z", estimated if np.any(known.gyro_bias) else "taken to be zero"))
+        rows.append(("gyro bias x, y, z", estimated if known.gyro_bias_std else "taken to be zero"))
     rows += [(label(name), remark) for name, remark in content.remarks.items() if remark]
     return _pairs_table(rows)
 
