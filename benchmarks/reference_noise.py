@@ -1,7 +1,7 @@
 """How far KITTI's ground truth is from its own IMU between consecutive frames: what a reference of that make can judge.
 
 ``python benchmarks/reference_noise.py --kitti DIR [--sequences 00 01 ...]`` takes poses, times and IMU of the odometry
-benchmark; by default the sequences with an IMU that are not for tests. It prints figures and asserts nothing.
+benchmark; by default the paper's training sequences that have an IMU. It prints figures and asserts nothing.
 `learned.held_out.Rig` has them.
 
 Rotations: a frame's turn against the gyroscopes', with mounting, bias and delay fitted to the sequence. Positions: the

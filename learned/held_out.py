@@ -36,8 +36,8 @@ class Rig:
     Calibration of a checkerboard: focal length 0.2 %, principal point 1 pixel of a thousand. Rectification: the
     right image shifted by 0.1 pixel, which is a disparity. Software stamps of a triggered camera: 0.5 ms.
 
-    The reference, about and along right, down and ahead of each pose: KITTI's GNSS/INS on the sequences that are not
-    for tests, from frame to frame against its own gyroscopes and accelerometers (``benchmarks/reference_noise.py``).
+    The reference, about and along right, down and ahead of each pose: KITTI's GNSS/INS on the paper's training
+    sequences, from frame to frame against its own gyroscopes and accelerometers (``benchmarks/reference_noise.py``).
     Such short stretches do not show how the height wanders, which satellites tell half as well as the place.
     """
 
