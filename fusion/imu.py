@@ -61,7 +61,7 @@ STEP_BATCH_S = 5.0  # as long as errors of pairs are correlated
 STEP_MIN_PAIRS = 20  # on either side
 STEP_MIN_BATCHES = 5
 STEP_CHANCE = 1e-6
-STEP_MIN = 8e-3  # rad/s: below, the drift of a front end can look like it
+STEP_MIN = 6e-3  # rad/s: from 5e-3 down, the drift of a front end can look like it
 
 # Where gyro and pairs disagree for long, the gyro is at fault too: front ends fail for single pairs, but an IMU that
 # saturates or loses its clock does so for a while.

@@ -173,6 +173,16 @@ def test_where_a_short_log_leaves_open_whether_a_gyro_has_a_bias_it_is_uncertain
     assert off < 4.0 * calibration.gyro_bias_std * np.sqrt(3.0)
 
 
+@pytest.mark.parametrize("seed", range(4, 8))
+def test_a_small_step_of_the_bias_is_told_from_the_drift_of_the_pairs(seed: int) -> None:
+    """0.4 deg/s, halfway through a hundred seconds, to some seconds; none where there is none."""
+    log = faults.simulated(seed, 100.0)
+    assert not len(calibrate(log.pairs, log.imu, None, None).bias_steps_ns)
+    step = np.array([0.0025, 0.005, -0.005])
+    found = calibrate(log.pairs, faults.gyro_bias_step(log.imu, 50.0, step), None, None)
+    assert_allclose((found.bias_steps_ns - log.imu.stamps_ns[0]) / NANOSECONDS, [50.0], atol=10.0)
+
+
 def _changed(imu: ImuSeries, **values: FloatArray) -> ImuSeries:
     return replace(imu, **values)
 
