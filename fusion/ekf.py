@@ -502,9 +502,10 @@ class Filter:
         variance = measured.covariance[3:, 3:].trace() / 3 / seconds**2 + self.unknown[1] ** 2 * seconds
         self._renew_velocity(variance)
 
-    def doubt_gyro_bias(self, sigma: float) -> None:
-        """Make the gyro's bias that much (rad/s) more uncertain: it has stepped."""
-        self.kf.P[GYRO_BIAS, GYRO_BIAS] += sigma**2 * np.eye(3)
+    def doubt_biases(self, accelerometer: FloatArray | float, gyro: FloatArray | float) -> None:
+        """Make the biases that much (m/s^2, rad/s; (3,) or the same for all axes) more uncertain: they have stepped."""
+        self.kf.P[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] += np.square(accelerometer) * np.eye(3)
+        self.kf.P[GYRO_BIAS, GYRO_BIAS] += np.square(gyro) * np.eye(3)
 
     def _renew_velocity(self, variance: float) -> None:
         P = self.kf.P.copy()
@@ -669,7 +670,10 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     for frame, (step, window, stands) in enumerate(zip(steps, windows, still, strict=True), 1):
         pair = _measurement(step, config)
         if calibration is not None and np.any(_during(calibration.bias_steps_ns, step)):
-            ekf.doubt_gyro_bias(calibration.gyro_bias_std)
+            ekf.doubt_biases(0.0, calibration.gyro_bias_std)
+        for stepped in measurements.bias_steps:
+            if step.source_stamp_ns == stepped.at_ns:
+                ekf.doubt_biases(stepped.std[:3], stepped.std[3:])
         lost = calibration is not None and window is None and turning_sigma(pair.covariance) > LOST
         if lost:
             ekf.lose_direction(pair)

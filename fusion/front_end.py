@@ -1,13 +1,7 @@
 """The lasting errors of a front end in the pose graph: scale error and rate bias, one state S a knot.
 
 They fade and wander (a Gauss-Markov process). How large scale errors are is not known of a front end beforehand, but
-the IMU sees the motion too, so that the log tells: by the evidence for each size, which is the probability of all that
-was measured whatever the motion was (MacKay, "Bayesian interpolation", Neural Computation 4, 1992). Of the linear
-problem |A x - b|^2 with A = Q R it is, but for a constant,
-
-    log p(b) = -|A x* - b|^2 / 2 - log |det R| + log |det W|                                                       (1)
-
-W being what whitens the process, the only part of A that has to do with it.
+the IMU sees the motion too, so that the log tells: by the evidence for each size.
 """
 
 from __future__ import annotations
@@ -20,13 +14,12 @@ from gtsam.symbol_shorthand import S
 from scipy.interpolate import CubicSpline
 
 from fusion.config import FusionConfig
+from fusion.evidence import Eliminate, evidence, graph_of
 from fusion_io.records import FloatArray
 
 FACTORS = 2.0 ** np.arange(-2, 3)  # of the scale error that is assumed, at which the evidence is computed
 DOUBT = 1.5  # by about this factor scale errors of a front end are larger or smaller than is assumed
 FINE = 201  # points at which the evidence is interpolated
-
-Eliminate = Callable[[gtsam.GaussianFactorGraph], gtsam.GaussianBayesNet]
 
 
 def process(seconds: FloatArray, sigmas: tuple[float, float], config: FusionConfig) -> list[gtsam.NonlinearFactor]:
@@ -63,19 +56,16 @@ def likely_scale(
     """
 
     def log_evidence(factor: float) -> float:
-        """Equation (1); of the four components of each state the scale error is one."""
+        """Of the four components of each state, one row of the process each, the scale error is one."""
         linear = process_of(factor)
         states = linear.size()
-        linear.push_back(others)
-        net = eliminate(linear)
-        diagonals = np.concatenate([net.at(place).R().diagonal() for place in range(net.size())])
-        return -float(linear.error(net.optimize()) + np.log(np.abs(diagonals)).sum() + states * np.log(factor))
+        return evidence(graph_of(linear, others), eliminate).log - states * float(np.log(factor))
 
     logs = np.log(FACTORS)
     fine = np.linspace(logs[0], logs[-1], FINE)
-    evidence = [log_evidence(factor) for factor in FACTORS.tolist()]
-    if not np.all(np.isfinite(evidence)):
-        raise RuntimeError("the evidence for the size of scale errors is not finite")
-    density = CubicSpline(logs, evidence)(fine) - 0.5 * (fine / np.log(DOUBT)) ** 2
+    density = (
+        CubicSpline(logs, [log_evidence(factor) for factor in FACTORS.tolist()])(fine)
+        - 0.5 * (fine / np.log(DOUBT)) ** 2
+    )
     weights = np.exp(density - density.max())
     return float(np.exp(weights @ fine / weights.sum()))

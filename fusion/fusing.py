@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from fusion import chain, ekf, online, posegraph
 from fusion.config import RunConfig
 from fusion.imu import ImuCalibration, in_camera_axes, on_camera_clock
-from fusion.measurements import Estimate, Measurements
+from fusion.measurements import BiasStep, Estimate, Measurements
 from fusion_io.errors import FusionError
 from fusion_io.findings import Findings
 from fusion_io.records import NANOSECONDS, ImuSeries, IntArray, PairEstimate
@@ -78,7 +78,13 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
         estimates["posegraph"] = graph
     refined = known
     if graph is not None:
-        refined = replace(known, mounting=graph.mounting, front_end_sigma=graph.front_end_sigma)
+        refined = replace(
+            known,
+            imu=known.imu and _without(graph.bias_steps, known.imu),
+            mounting=graph.mounting,
+            front_end_sigma=graph.front_end_sigma,
+            bias_steps=graph.bias_steps,
+        )
     if graph is not None and graph.mounting is None:
         refined = replace(known, imu=None, calibration=None)
     for name in asked[1:] if "posegraph" in asked else asked:
@@ -89,6 +95,18 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
                     estimate.hindsight, "the EKF in hindsight: its loops move what was before them"
                 )
     return estimates
+
+
+def _without(steps: Sequence[BiasStep], imu: ImuSeries) -> ImuSeries:
+    """The samples as if the biases had not stepped."""
+    for step in steps:
+        after = (imu.stamps_ns >= step.at_ns)[:, None]
+        imu = replace(
+            imu,
+            linear_acceleration=imu.linear_acceleration - after * step.by[:3],
+            angular_velocity=imu.angular_velocity - after * step.by[3:],
+        )
+    return imu
 
 
 def _by_the_graph(name: str, known: Measurements, refined: Measurements) -> str:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dtrtri
 
 from fusion_io.records import FloatArray
 
@@ -65,7 +66,7 @@ def _joined(
     rows_above: dict[int, tuple[int, int]],
 ) -> Joint:
     """A variable joined to its parents: R x + S p = d + noise."""
-    root_inverse = np.linalg.inv(conditional.R())
+    root_inverse, _ = dtrtri(conditional.R())
     n = len(root_inverse)
     by_parents = -root_inverse @ conditional.S()
     crossed = by_parents @ of_parents

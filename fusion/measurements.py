@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fusion.gnss import Georeference, Positions
 from fusion.imu import ImuCalibration
-from fusion_io.records import EstimatorSeries, FloatArray, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, ImuSeries, PairEstimate, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,25 @@ class Mounting:
         return float(np.sqrt(self.covariance[6, 6]))
 
 
+class BiasStep(NamedTuple):
+    """A bias of the IMU stepped just before the frame at_ns: by (6,), accelerometer (m/s^2), then gyro (rad/s).
+
+    std (6,): how uncertain both are by then. Zero is what did not step. Of a bias that wanders, by is zero: it may have
+    stepped.
+    """
+
+    at_ns: int
+    by: FloatArray
+    std: FloatArray
+
+    def described(self, start_ns: int) -> str:
+        """What stepped by how much, and how long after the start."""
+        of_gyro = bool(np.any(self.by[3:]))
+        sensor, by, unit = ("gyro", self.by[3:], "rad/s") if of_gyro else ("accelerometer", self.by[:3], "m/s^2")
+        at_s = (self.at_ns - start_ns) / NANOSECONDS
+        return f"the {sensor}'s bias steps by {np.linalg.norm(by):.2g} {unit} at {at_s:.0f} s"
+
+
 @dataclass(frozen=True, slots=True)
 class Measurements:
     """All that is known about one motion of the camera.
@@ -66,9 +86,10 @@ class Measurements:
     steps: pair estimates that follow each other without holes (`chain.bridge_gaps`). imu: samples in the IMU's own axes
     on the camera's clock, without what is faulty, and calibration: what is known of how they relate to the camera; both
     None where there is no IMU to be used. mounting: the same where a back end has refined it. front_end_sigma: of the
-    front end's scale error and rate bias (rad/s), where a back end has found out how large they are. skips: pair
-    estimates between frames of the same steps that are further apart. loops: the same between frames where the camera
-    came back. gnss: positions of an antenna.
+    front end's scale error and rate bias (rad/s), where a back end has found out how large they are. bias_steps: what a
+    back end has found of the IMU, and was taken out of its samples. skips: pair estimates between frames of the same
+    steps that are further apart. loops: the same between frames where the camera came back. gnss: positions of an
+    antenna.
     """
 
     steps: Sequence[PairEstimate]
@@ -76,6 +97,7 @@ class Measurements:
     calibration: ImuCalibration | None = None
     mounting: Mounting | None = None
     front_end_sigma: tuple[float, float] | None = None
+    bias_steps: Sequence[BiasStep] = ()
     skips: Sequence[PairEstimate] = ()
     loops: Sequence[PairEstimate] = ()
     gnss: Positions | None = None
@@ -88,8 +110,9 @@ class Estimate:
     trajectory: with the covariance of every pose. note: one line on how the measurements were used. rejected: how many
     of them were left out as outliers. series: what was estimated beside the poses. loops_used (M,): which of the loops
     were believed; empty for a back end that takes none. mounting: as it was refined. front_end_sigma: as in
-    `Measurements`. georeference: where on the earth the world is, where positions told it. hindsight: of a causal back
-    end, the trajectory where its last instant sees it, where loops moved what was before them.
+    `Measurements`. bias_steps: those of the IMU that were found, in order of time. georeference: where on the earth the
+    world is, where positions told it. hindsight: of a causal back end, the trajectory where its last instant sees it,
+    where loops moved what was before them.
     """
 
     trajectory: Trajectory
@@ -99,5 +122,6 @@ class Estimate:
     loops_used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     mounting: Mounting | None = None
     front_end_sigma: tuple[float, float] | None = None
+    bias_steps: Sequence[BiasStep] = ()
     georeference: Georeference | None = None
     hindsight: Trajectory | None = None

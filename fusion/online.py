@@ -29,7 +29,7 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
-from fusion import front_end
+from fusion import biases, front_end
 from fusion.chain import ImuWindow, ImuWindows, motions_of, stamps_of
 from fusion.config import PoseGraphConfig
 from fusion.drift import Closures, Odometry, Pose
@@ -42,7 +42,9 @@ from fusion.posegraph import (
     GRAVITY,
     KNOT_S,
     REJECTED_WEIGHT,
+    bias_walk,
     check,
+    first_bias_sigmas,
     preintegrate,
     preintegration,
 )
@@ -133,7 +135,8 @@ class Smoother:
         told = measurements.front_end_sigma or assumed
         # Larger scale errors are not let in: what never looks back takes wrong pairs for them, and jumps.
         self._front_end_sigma = min(told[0], assumed[0]), told[1]
-        self._seconds = (stamps_of(self._steps) - self._steps[0].source_stamp_ns) / NANOSECONDS
+        self._stamps = stamps_of(self._steps)
+        self._seconds = (self._stamps - self._stamps[0]) / NANOSECONDS
         covariances = np.stack([step.covariance for step in self._steps])
         self._whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
         motions = motions_of(self._steps)
@@ -141,6 +144,7 @@ class Smoother:
         rates = np.hstack([motions.rotation.as_rotvec(), motions.translation]) / np.diff(self._seconds)[:, None]
         self._calibration = measurements.calibration if measurements.imu is not None else None
         self._samples = ImuWindows(measurements.imu) if measurements.imu is not None else None
+        self._bias_steps = measurements.bias_steps
         self._gate = float(chi2.isf(config.gate_probability, 6))
         self._T_camera_imu = np.eye(4)
         if self._calibration is not None:
@@ -236,14 +240,13 @@ class Smoother:
         self._twist = self._twists_by(0, inertial)[0]
         velocity = self._T_camera_imu[:3, :3] @ self._twist[3:]
         bias = _first_bias(calibration)
-        bias_sigmas = [config.accelerometer_bias_sigma, np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)]
         self._values.insert(V(0), velocity)
         self._values.insert(B(0), bias)
         strayed, covariance = self._mounting_prior(calibration)
         self._values.insert(E(0), strayed)
         self._factors += [
             gtsam.PriorFactorVector(V(0), velocity, gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)),
-            gtsam.PriorFactorConstantBias(B(0), bias, gtsam.noiseModel.Diagonal.Sigmas(np.repeat(bias_sigmas, 3))),
+            biases.link(bias, 0, first_bias_sigmas(calibration, config)),
             gtsam.PriorFactorVector(E(0), strayed, gtsam.noiseModel.Gaussian.Covariance(covariance)),
         ]
         self._world = WorldFactor(self._T_camera_imu, self._twist[None], FIRST_POSE_SIGMA)
@@ -292,10 +295,12 @@ class Smoother:
         self._factors.append(front_end.walk(knot, dt, self._front_end_sigma, config))
         if self._calibration is not None:
             self._values.insert(B(knot + 1), self._values.atConstantBias(B(knot)))
-            walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3) * np.sqrt(dt)
-            noise = gtsam.noiseModel.Diagonal.Sigmas(walk)
-            same = gtsam.imuBias.ConstantBias()
-            self._factors.append(gtsam.BetweenFactorConstantBias(B(knot), B(knot + 1), same, noise))
+            starts_ns = self._stamps[[self._begins[knot], self._latest]]
+            [sigmas] = bias_walk(starts_ns, self._calibration, config)
+            for step in self._bias_steps:
+                if step.at_ns == starts_ns[1]:
+                    sigmas = np.hypot(sigmas, step.std)
+            self._factors.append(biases.link(_first_bias(self._calibration), knot + 1, sigmas))
 
     def _add_inertial(self, step: int, inertial: _Inertial | None) -> None:
         """The factor between two frames that the IMU measured; over others the velocity walks."""

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import gtsam
@@ -28,18 +27,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
-from fusion import front_end, gnss, marginals, outliers
+from fusion import biases, front_end, gnss, marginals, outliers
+from fusion.biases import Doubt
 from fusion.chain import ImuWindow, ImuWindows, chain, mean_rates, motions_of
 from fusion.config import PoseGraphConfig, Robust
+from fusion.evidence import graph_of
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
 from fusion.imu import ImuCalibration
-from fusion.measurements import Estimate, Measurements, Mounting
+from fusion.measurements import BiasStep, Estimate, Measurements, Mounting
 from fusion.pair_model import camera, inverse
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
 from fusion_io.words import counted
 
 GRAVITY = 9.81  # m/s^2; how far the place differs from it goes into the accelerometer's bias
+DOUBTFUL_NOISE = 1.0  # m/s^2/sqrt(Hz), of an accelerometer whose bias wanders: no scale follows from it
 GRAVITY_STEPS = 100  # steps over which accelerations are averaged for a first direction of gravity
 FIRST_POSE_SIGMA = 1e-6  # rad, m: small beside any estimate, not so small that the solver suffers
 INTEGRATION_SIGMA = 1e-4  # m/s/sqrt(Hz): error of integrating positions piece by piece
@@ -55,7 +57,8 @@ MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance i
 
 MAX_ITERATIONS = 30
 FORGIVING_ITERATIONS = 2  # before anything is judged
-CONVERGED = 0.1  # of what a step lowers the squares by: it moves nothing by more than a third of its sigma
+CONVERGED = 1e-4  # of what a step lowers the squares by: it moves nothing by more than a hundredth of its sigma
+SETTLED = 10.0  # the same, where the log is asked for what was assumed: all assumptions are at as much of a loss by it
 ANNEALING = 4.0  # of the kernel's width from step to step; by larger steps wrong loops drag good pairs out with them
 REJECTED_WEIGHT = 1e-4  # of a step whose pair is left out: no more than a hint, where nothing else is known
 
@@ -70,6 +73,8 @@ class Problem:
     The first factor holds X(0) still. T_camera_imu (4, 4): what E(0) strays from. twists (K, 6): of the IMU at the
     stamps of the poses, or None where the poses are those of the camera. knots (K,): the front end's state at each
     stamp. front_end_sigma: of its scale error and rate bias; front_end_rows: the factors between its states.
+    first_bias, bias_sigmas (J, 6): what is known of the IMU's biases at first, and from knot to knot, bias_rows: the
+    factors that say so; doubts: what was found to contradict it.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -81,6 +86,10 @@ class Problem:
     batches: list[Batch] = field(default_factory=list)
     front_end_sigma: tuple[float, float] = (0.0, 0.0)
     front_end_rows: range = range(0)
+    first_bias: gtsam.imuBias.ConstantBias = field(default_factory=gtsam.imuBias.ConstantBias)
+    bias_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
+    bias_rows: range = range(0)
+    doubts: list[Doubt] = field(default_factory=list)
 
     @property
     def between_knots_s(self) -> FloatArray:
@@ -137,14 +146,21 @@ def _windows(measurements: Measurements) -> tuple[list[ImuWindow | None], str]:
 
 
 def _solve(
-    measurements: Measurements, windows: Sequence[ImuWindow | None], without_imu: str, config: PoseGraphConfig
+    measurements: Measurements,
+    measured: Sequence[ImuWindow | None],
+    without_imu: str,
+    config: PoseGraphConfig,
+    wandering: Sequence[Doubt] = (),
 ) -> Estimate:
+    """wandering: what was found of the accelerometer, which is hardly believed then."""
+    if wandering:
+        config = config.model_copy(update={"accelerometer_noise": max(config.accelerometer_noise, DOUBTFUL_NOISE)})
     steps, calibration = measurements.steps, measurements.calibration
-    inertial = calibration if any(window is not None for window in windows) else None
+    inertial = calibration if any(window is not None for window in measured) else None
     mounting = Rotation.identity() if inertial is None else inertial.mounting
     bias = np.zeros(3) if inertial is None else inertial.gyro_bias
-    wrong = outliers.suspects(steps, windows, mounting, bias, config.gate_probability)
-    windows = [None if bad else window for window, bad in zip(windows, wrong.imu, strict=True)]
+    wrong = outliers.suspects(steps, measured, mounting, bias, config.gate_probability)
+    windows = [None if bad else window for window, bad in zip(measured, wrong.imu, strict=True)]
 
     start = _repaired(steps, windows, wrong.pair, mounting, bias)
     problem = _pairs_only(steps, start) if inertial is None else _with_imu(steps, start, windows, inertial, config)
@@ -158,6 +174,10 @@ def _solve(
     _add_front_end(problem, config)
     tie, without_gnss = gnss.tie(problem, measurements.gnss)
     solution = minimise(problem, config)
+    found = [doubt for doubt in problem.doubts if doubt.wanders]
+    if found and not wandering:
+        return _solve(measurements, measured, without_imu, config, found)
+    problem.doubts += wandering
 
     if inertial is not None:
         _refuse_contradiction(problem.graph, solution.values, (pairs.weights < 0.5) & ~wrong.pair)
@@ -165,16 +185,20 @@ def _solve(
     loops_used = loops.weights >= 0.5
     georeference = tie.georeference(problem, solution) if tie else None
     told = None if problem.front_end_sigma == config.front_end_sigma(steps) else problem.front_end_sigma
+    stepped = _bias_steps(problem, solution)
+    notes = [step.described(problem.stamps_ns[0]) for step in stepped if np.any(step.by)]
+    notes += ["the accelerometer's bias wanders: it is hardly believed"] if wandering else []
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
-        _note(windows, without_imu, told, skips.weights < 0.5, len(rejected), loops_used)
+        _note(windows, without_imu, told, notes, skips.weights < 0.5, len(rejected), loops_used)
         + gnss.note(measurements.gnss, georeference, without_gnss),
         len(rejected) + int(wrong.imu.sum()) + sum(int(np.sum(each.weights < 0.5)) for each in others),
         series_of(problem, solution, pairs),
         loops_used,
         _mounting(problem, solution),
         told,
+        stepped,
         georeference,
     )
 
@@ -288,6 +312,12 @@ def _with_imu(
     knots = _knots(start.stamps_ns)
     for j in range(knots[-1] + 1):
         values.insert(B(j), bias)
+    bias_sigmas = np.vstack(
+        [first_bias_sigmas(calibration, config), bias_walk(start.stamps_ns[_first(knots)], calibration, config)]
+    )
+    bias_rows = range(graph.size(), graph.size() + len(bias_sigmas))
+    for factor in biases.walk(bias, bias_sigmas):
+        graph.add(factor)
     used = [(k, window) for k, window in enumerate(windows) if window is not None]
     values.insert(G(0), gtsam.Unit3(_gravity(used[:GRAVITY_STEPS], poses, velocities)))
     values.insert(E(0), np.zeros(10))
@@ -300,16 +330,14 @@ def _with_imu(
     )
     graph.add(gtsam.PriorFactorVector(E(0), np.zeros(10), _diagonal(sigmas)))
 
-    gyro_bias_sigma = np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)
-    sigmas = np.repeat([config.accelerometer_bias_sigma, gyro_bias_sigma], 3)
-    graph.add(gtsam.PriorFactorConstantBias(B(0), bias, _diagonal(sigmas)))
-    _add_bias_walk(graph, start.stamps_ns, knots, calibration, config)
     _add_preintegrated(graph, windows, knots, bias, np.diff(seconds), config)
 
     twists = np.zeros((len(poses), 6))
     twists[:, :3] = _rates(used, seconds, config.gyro_noise)
     twists[:, 3:] = np.einsum("nji,nj->ni", poses[:, :3, :3], velocities)
-    return Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
+    problem = Problem(graph, values, start.stamps_ns, T_camera_imu, twists, knots)
+    problem.first_bias, problem.bias_sigmas, problem.bias_rows = bias, bias_sigmas, bias_rows
+    return problem
 
 
 def _rates(windows: Sequence[tuple[int, ImuWindow]], seconds: FloatArray, gyro_noise: float) -> FloatArray:
@@ -338,22 +366,23 @@ def _mean_rates(windows: Sequence[tuple[int, ImuWindow]], seconds: FloatArray, s
     return np.stack([np.interp(seconds, seconds[known], axis) for axis in means.T], axis=1)
 
 
-def _add_bias_walk(
-    graph: gtsam.NonlinearFactorGraph,
-    stamps_ns: IntArray,
-    knots: IntArray,
-    calibration: ImuCalibration,
-    config: PoseGraphConfig,
-) -> None:
-    """The biases of the IMU, one state a knot, wander; where the gyro's stepped, it is as uncertain as at first."""
+def first_bias_sigmas(calibration: ImuCalibration, config: PoseGraphConfig) -> FloatArray:
+    """How uncertain (6,) the biases are at first: accelerometer (m/s^2), then gyro (rad/s)."""
+    gyro = np.hypot(config.gyro_bias_sigma, calibration.gyro_bias_std)
+    return np.repeat([config.accelerometer_bias_sigma, gyro], 3)
+
+
+def bias_walk(starts_ns: IntArray, calibration: ImuCalibration, config: PoseGraphConfig) -> FloatArray:
+    """By how much (J - 1, 6) the biases may differ between knots that start at (J,).
+
+    They wander; where the calibration found that the gyro's stepped, it is as uncertain as at first.
+    """
     walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3)
-    starts_ns = stamps_ns[_first(knots)]
     step = np.repeat([0.0, calibration.gyro_bias_std], 3)
-    for j, (start_ns, end_ns) in enumerate(pairwise(starts_ns.tolist())):
-        stepped = np.any((calibration.bias_steps_ns >= start_ns) & (calibration.bias_steps_ns < end_ns))
-        sigmas = np.hypot(walk * np.sqrt((end_ns - start_ns) / NANOSECONDS), step * stepped)
-        noise = _diagonal(sigmas)
-        graph.add(gtsam.BetweenFactorConstantBias(B(j), B(j + 1), gtsam.imuBias.ConstantBias(), noise))
+    at_ns = calibration.bias_steps_ns[:, None]
+    stepped = np.any((at_ns >= starts_ns[:-1]) & (at_ns < starts_ns[1:]), axis=0)
+    seconds = np.diff(starts_ns) / NANOSECONDS
+    return np.asarray(np.hypot(walk * np.sqrt(seconds)[:, None], step * stepped[:, None]))
 
 
 def _add_preintegrated(
@@ -449,7 +478,8 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
     judged = [batch for batch in problem.batches if batch.judged]
     gates = [chi2.isf(config.gate_probability, batch.dimension) for batch in judged]
     order = elimination_order(problem)
-    values, width, scale_known = problem.values, np.inf, not _shows_scale(problem, config)
+    values, width, asking = problem.values, np.inf, problem.twists is not None
+    lowered = 0.0  # by the step before; none
     for iteration in range(MAX_ITERATIONS):
         for batch in problem.batches:
             batch.update(values)
@@ -460,13 +490,16 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
             width = _reweigh(judged, gates, width, config.robust)
         linear = problem.graph.linearize(values)
         step = _eliminated(linear.eliminateMultifrontal, order, problem.tied_up).optimize()
-        lowered = 2.0 * (linear.error(values.zeroVectors()) - linear.error(step))
+        before, lowered = lowered, 2.0 * (linear.error(values.zeroVectors()) - linear.error(step))
         point, values = values, values.retract(step)
-        if iteration >= FORGIVING_ITERATIONS and width <= 1.0 and lowered < CONVERGED:
-            if scale_known:
+        if iteration >= FORGIVING_ITERATIONS and width <= 1.0:
+            # By the next step: they shrink by the same factor, or faster.
+            ahead = lowered**2 / before if before > lowered else lowered
+            if asking and ahead < SETTLED:
+                asking = _renew_assumptions(problem, point, linear, order, config)
+                lowered = 0.0
+            elif not asking and ahead < CONVERGED:
                 break
-            _renew_scale(problem, point, linear, order, config)
-            scale_known = True
     if not np.all(np.isfinite(poses_of(values))):
         raise RuntimeError("the solution is not finite")
     _make_first_camera_the_world(problem, values)
@@ -496,37 +529,75 @@ def _shows_scale(problem: Problem, config: PoseGraphConfig) -> bool:
     return problem.twists is not None and seconds > LEAST_CORRELATION_TIMES * config.pair_scale_correlation_s
 
 
-def _renew_scale(
+def _renew_assumptions(
     problem: Problem,
     point: gtsam.Values,
     linear: gtsam.GaussianFactorGraph,
     order: gtsam.Ordering,
     config: PoseGraphConfig,
-) -> None:
-    """Take the size of the front end's scale errors from the log; linear: the problem at a point near its solution."""
+) -> bool:
+    """Take from the log what was assumed of it: the size of scale errors, and how biases of the IMU behave.
+
+    linear: the problem at a point near its solution. Returns whether they did not as assumed: then there may be more.
+    """
     assumed, rate = problem.front_end_sigma
 
     def process(factor: float) -> list[gtsam.NonlinearFactor]:
         return front_end.process(problem.between_knots_s, (factor * assumed, rate), config)
 
     def linear_process(factor: float) -> gtsam.GaussianFactorGraph:
-        return _graph([each.linearize(point) for each in process(factor)])
+        return graph_of(each.linearize(point) for each in process(factor))
 
     def eliminate(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesNet:
-        return _eliminated(graph.eliminateSequential, order, problem.tied_up)
+        return _eliminated(graph.eliminateSequential, rest, problem.tied_up)
 
-    others = _graph([linear.at(row) for row in range(linear.size()) if row not in problem.front_end_rows])
-    factor = front_end.likely_scale(others, linear_process, eliminate)
+    others, rest = _between_knots(problem, linear, order)
+    factor = 1.0
+    if _shows_scale(problem, config):
+        walks = graph_of(linear.at(row) for row in problem.bias_rows)
+        factor = front_end.likely_scale(graph_of(others, walks), linear_process, eliminate)
+    others.push_back(linear_process(factor))
+    if len(problem.doubts) < biases.MOST:
+        doubt = biases.likely_doubt(others, point, problem.first_bias, problem.bias_sigmas, eliminate)
+        if doubt is not None:  # what the scale seemed to be is an effect of it, too
+            problem.doubts.append(doubt)
+            problem.bias_sigmas = doubt.on(problem.bias_sigmas)
+            for knot in doubt.knots:
+                loose = biases.link(problem.first_bias, knot, problem.bias_sigmas[knot])
+                problem.graph.replace(problem.bias_rows[knot], loose)
+            return True
     problem.front_end_sigma = factor * assumed, rate
     for row, each in zip(problem.front_end_rows, process(factor), strict=True):
         problem.graph.replace(row, each)
+    return False
 
 
-def _graph(factors: Sequence[gtsam.GaussianFactor]) -> gtsam.GaussianFactorGraph:
-    graph = gtsam.GaussianFactorGraph()
-    for factor in factors:
-        graph.push_back(factor)
-    return graph
+def _between_knots(
+    problem: Problem, linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering
+) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering]:
+    """What a linear problem, but for the factors that are assumed, tells of knots; and how that is eliminated.
+
+    Frames that only those of their own knot and the next one's first are tied to have nothing to do with assumptions,
+    so that they are eliminated once for all of them.
+    """
+    assumed = {*problem.front_end_rows, *problem.bias_rows}
+    others = graph_of(linear.at(row) for row in range(linear.size()) if row not in assumed)
+    frames = len(problem.knots)
+    first = _first(problem.knots)
+    last = np.append(first[1:], frames - 1)[problem.knots]
+    ends = np.isin(np.arange(frames), [*first, frames - 1])
+    tied = ends.copy()
+    for batch in problem.batches:
+        if isinstance(batch, PairFactors):
+            far = batch.target > last[batch.source]
+            tied[batch.source[far]] = tied[batch.target[far]] = True
+    gone = {*map(X, np.flatnonzero(~tied).tolist()), *map(V, np.flatnonzero(~ends).tolist())}
+    inner, rest = gtsam.Ordering(), gtsam.Ordering()
+    for place in range(order.size()):
+        key = order.at(place)
+        (inner if key in gone else rest).push_back(key)
+    _, reduced = _eliminated(others.eliminatePartialSequential, inner, problem.tied_up)
+    return reduced, rest
 
 
 def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> None:
@@ -657,6 +728,22 @@ def _mounting(problem: Problem, solution: Solution) -> Mounting | None:
     )
 
 
+def _bias_steps(problem: Problem, solution: Solution) -> list[BiasStep]:
+    """Those that were found, in order of time; of a bias that wanders, all that there may be."""
+    starts_ns = problem.stamps_ns[_first(problem.knots)].tolist()
+    found = []
+    for doubt in problem.doubts:
+        if doubt.is_step:
+            [knot] = doubt.knots
+            before, after = (solution.values.atConstantBias(B(j)).vector() for j in (knot - 1, knot))
+            std = np.sqrt(np.diag(solution.covariances[B(knot)]))
+            by, of_both = (np.where(doubt.sigma > 0.0, each, 0.0) for each in (after - before, std))
+            found.append(BiasStep(starts_ns[knot], by, of_both))
+        elif doubt.wanders:
+            found += [BiasStep(starts_ns[knot], np.zeros(6), doubt.sigma) for knot in doubt.knots]
+    return sorted(found, key=lambda step: step.at_ns)
+
+
 def _std_at(problem: Problem, solution: Solution, symbol: Callable[[int], int]) -> FloatArray:
     """The standard deviations (K, M) at every stamp of the states of a knot."""
     knots = range(problem.knots[-1] + 1)
@@ -667,6 +754,7 @@ def _note(
     windows: Sequence[ImuWindow | None],
     without_imu: str,
     front_end_told: tuple[float, float] | None,
+    stepped: Sequence[str],
     skips_rejected: NDArray[np.bool_],
     pairs_rejected: int,
     loops_used: NDArray[np.bool_],
@@ -679,4 +767,4 @@ def _note(
     rejected = f"; pairs rejected: {pairs_rejected}" if pairs_rejected else ""
     loops = f"; loops used: {loops_used.sum()} of {len(loops_used)}" if len(loops_used) else ""
     scale = f"; the pairs' scale errors have a sigma of {100 * front_end_told[0]:.2g} %" if front_end_told else ""
-    return imu + scale + skipping + rejected + loops
+    return imu + scale + "".join(f"; {step}" for step in stepped) + skipping + rejected + loops

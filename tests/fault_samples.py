@@ -96,6 +96,13 @@ def accelerometer_bias_step(imu: ImuSeries, at_s: float, step: FloatArray) -> Im
     return replace(imu, linear_acceleration=imu.linear_acceleration + _during(imu, at_s)[:, None] * step)
 
 
+def swinging_accelerometer(imu: ImuSeries, by: FloatArray, period_s: float) -> ImuSeries:
+    """The accelerometer shows (3,) m/s^2 more and less in turn: no bias does, nor one that steps."""
+    seconds = (imu.stamps_ns - imu.stamps_ns[0]) / NANOSECONDS
+    swing = np.sin(2 * np.pi * seconds / period_s)[:, None] * by
+    return replace(imu, linear_acceleration=imu.linear_acceleration + swing)
+
+
 def clock_jump(imu: ImuSeries, at_s: float, by_s: float) -> ImuSeries:
     """From some time on the stamps are ahead by so much; those that repeat the past are left out, as a reader does."""
     stamps = imu.stamps_ns + np.where(_during(imu, at_s), round(by_s * NANOSECONDS), 0)
