@@ -43,7 +43,6 @@ from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
@@ -502,10 +501,10 @@ class Filter:
         variance = measured.covariance[3:, 3:].trace() / 3 / seconds**2 + self.unknown[1] ** 2 * seconds
         self._renew_velocity(variance)
 
-    def doubt_biases(self, accelerometer: FloatArray | float, gyro: FloatArray | float) -> None:
-        """Make the biases that much (m/s^2, rad/s; (3,) or the same for all axes) more uncertain: they have stepped."""
-        self.kf.P[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] += np.square(accelerometer) * np.eye(3)
-        self.kf.P[GYRO_BIAS, GYRO_BIAS] += np.square(gyro) * np.eye(3)
+    def doubt_biases(self, std: FloatArray) -> None:
+        """Make the biases of accelerometer and gyro more uncertain by std (6,): they may have stepped."""
+        self.kf.P[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] += np.diag(std[:3] ** 2)
+        self.kf.P[GYRO_BIAS, GYRO_BIAS] += np.diag(std[3:] ** 2)
 
     def _renew_velocity(self, variance: float) -> None:
         P = self.kf.P.copy()
@@ -660,6 +659,7 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     first_twist = steps[0].T_source_target.as_exp_coords() / steps[0].duration_s
     front_end_sigma = measurements.front_end_sigma or config.front_end_sigma(steps)
     ekf = Filter(config, calibration, measurements.mounting, front_end_sigma, first_twist)
+    bias_steps = [] if calibration is None else [*calibration.bias_steps, *measurements.bias_steps]
     gate = chi2.isf(config.gate_probability, 6)
     stamps_ns = stamps_of(steps)
     closures = Closures(measurements.loops, stamps_ns, config.gate_probability)
@@ -669,11 +669,9 @@ def solve(measurements: Measurements, config: EkfConfig) -> Estimate:
     skips_rejected = 0
     for frame, (step, window, stands) in enumerate(zip(steps, windows, still, strict=True), 1):
         pair = _measurement(step, config)
-        if calibration is not None and np.any(_during(calibration.bias_steps_ns, step)):
-            ekf.doubt_biases(0.0, calibration.gyro_bias_std)
-        for stepped in measurements.bias_steps:
-            if step.source_stamp_ns == stepped.at_ns:
-                ekf.doubt_biases(stepped.std[:3], stepped.std[3:])
+        for stepped in bias_steps:
+            if step.source_stamp_ns <= stepped.at_ns < step.target_stamp_ns:
+                ekf.doubt_biases(stepped.std)
         lost = calibration is not None and window is None and turning_sigma(pair.covariance) > LOST
         if lost:
             ekf.lose_direction(pair)
@@ -741,11 +739,6 @@ def _over_two_steps(skips: Sequence[PairEstimate], stamps_ns: IntArray) -> dict[
     frames = {before: frame for frame, before in enumerate(stamps_ns.tolist()[:-2], 2)}
     found = ((frames.get(skip.source_stamp_ns), skip) for skip in skips)
     return {frame: skip for frame, skip in found if frame and stamps_ns[frame] == skip.target_stamp_ns}
-
-
-def _during(stamps_ns: IntArray, step: PairEstimate) -> NDArray[np.bool_]:
-    """Which stamps (M,) fall into a step."""
-    return np.asarray((stamps_ns >= step.source_stamp_ns) & (stamps_ns < step.target_stamp_ns))
 
 
 def _by_stamps(pair: PairEstimate, jitter_s: float) -> FloatArray:

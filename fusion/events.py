@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
 from fusion import clocks, sensors
+from fusion.imu import WANDERS, BiasStep
 from fusion.sensors import MAD_TO_STD, runs
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate, Trajectory
 from fusion_io.words import counted
@@ -28,9 +29,14 @@ DROPPED_FRAMES = "dropped frames"
 MISSING_PAIRS = "missing pairs"
 WRONG_PAIR = "wrong pairs"
 CONTRADICTION = "contradiction"
+BIAS_STEP = "bias step"
+BIAS_WANDERS = "bias wanders"
 STAND_STILL = "stand-still"
 
-FAULTS = (IMU_GAP, STUCK, SATURATED, CLOCK_JUMP, DROPPED_FRAMES, MISSING_PAIRS, WRONG_PAIR, CONTRADICTION)
+FAULTS = (
+    *(IMU_GAP, STUCK, SATURATED, CLOCK_JUMP, DROPPED_FRAMES, MISSING_PAIRS, WRONG_PAIR, CONTRADICTION),
+    *(BIAS_STEP, BIAS_WANDERS),
+)
 """The kinds that are a sensor's fault; a stand-still is not."""
 
 # A hole is where samples are further apart than so many of their median periods.
@@ -220,6 +226,15 @@ def clock_jumps(imu: ImuSeries, pairs: Sequence[PairEstimate], topic: str) -> li
         text = f"the clock of the IMU jumps by {jump.by_s:+.2f} s against the camera's"
         events.append(Event(jump.at_ns, jump.at_ns + NANOSECONDS // 2, CLOCK_JUMP, topic, text))
     return events
+
+
+def bias_steps(steps: Sequence[BiasStep], topic: str) -> list[Event]:
+    """Where a bias of the IMU stepped, to a second, on the camera's clock; and where it wanders."""
+    known = [step for step in steps if step.is_known]
+    found = [Event(step.at_ns - NANOSECONDS, step.at_ns, BIAS_STEP, topic, str(step)) for step in known]
+    if unknown_ns := [step.at_ns for step in steps if not step.is_known]:
+        found.append(Event(min(unknown_ns), max(unknown_ns), BIAS_WANDERS, topic, WANDERS))
+    return found
 
 
 def contradictions(faulty_ns: IntArray, time_offset_s: float, known: Sequence[Event], topic: str) -> list[Event]:

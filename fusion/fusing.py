@@ -11,8 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from fusion import chain, ekf, online, posegraph
 from fusion.config import RunConfig
-from fusion.imu import ImuCalibration, in_camera_axes, on_camera_clock
-from fusion.measurements import BiasStep, Estimate, Measurements
+from fusion.imu import WANDERS, BiasStep, ImuCalibration, in_camera_axes, on_camera_clock
+from fusion.measurements import Estimate, Measurements
 from fusion_io.errors import FusionError
 from fusion_io.findings import Findings
 from fusion_io.records import NANOSECONDS, ImuSeries, IntArray, PairEstimate
@@ -78,6 +78,9 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
         estimates["posegraph"] = graph
     refined = known
     if graph is not None:
+        stepped = sum(step.is_known for step in graph.bias_steps)
+        of_graph.put("imu_bias_steps", stepped, f"steps of the IMU's biases, taken out of it: {stepped}")
+        of_graph.put("accelerometer_wanders", int(stepped < len(graph.bias_steps)), WANDERS)
         refined = replace(
             known,
             imu=known.imu and _without(graph.bias_steps, known.imu),

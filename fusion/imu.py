@@ -99,6 +99,33 @@ class Change(NamedTuple):
     bias: FloatArray
 
 
+WANDERS = "the accelerometer's bias wanders: it is hardly believed"
+"""What is said of bias steps that are not known."""
+
+
+class BiasStep(NamedTuple):
+    """A bias of the IMU stepped just before the frame at_ns: by (6,), accelerometer (m/s^2), then gyro (rad/s).
+
+    std (6,): how uncertain both are by then. Zero is what did not step. Of a bias that wanders, by is zero: it may have
+    stepped.
+    """
+
+    at_ns: int
+    by: FloatArray
+    std: FloatArray
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is known by how much."""
+        return bool(np.any(self.by))
+
+    def __str__(self) -> str:
+        """What stepped, and by how much."""
+        of_gyro = bool(np.any(self.by[3:]))
+        sensor, by, unit = ("gyro", self.by[3:], "rad/s") if of_gyro else ("accelerometer", self.by[:3], "m/s^2")
+        return f"the {sensor}'s bias steps by {np.linalg.norm(by):.2g} {unit}"
+
+
 @dataclass(frozen=True, slots=True)
 class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.
@@ -130,6 +157,18 @@ class ImuCalibration:
         at_ns = np.array([change.at_ns for change in self.changes], dtype=np.int64)
         stepped = np.array([bool(np.any(change.bias)) for change in self.changes], dtype=np.bool_)
         return np.asarray((at_ns - jumped - offset_ns)[stepped])
+
+    @property
+    def bias_steps(self) -> list[BiasStep]:
+        """Those steps; they are taken out of the samples on the camera's clock."""
+        biases = [change.bias for change in self.changes if np.any(change.bias)]
+        if not biases:
+            return []
+        std = np.repeat([0.0, self.gyro_bias_std], 3)
+        return [
+            BiasStep(at_ns, np.concatenate([np.zeros(3), bias]), std)
+            for at_ns, bias in zip(self.bias_steps_ns.tolist(), biases, strict=True)
+        ]
 
     @property
     def mounting(self) -> Rotation:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fusion.gnss import Georeference, Positions
-from fusion.imu import ImuCalibration
-from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, ImuSeries, PairEstimate, Trajectory
+from fusion.imu import BiasStep, ImuCalibration
+from fusion_io.records import EstimatorSeries, FloatArray, ImuSeries, PairEstimate, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,25 +57,6 @@ class Mounting:
     def ahead_std_s(self) -> float:
         """Of ahead_s."""
         return float(np.sqrt(self.covariance[6, 6]))
-
-
-class BiasStep(NamedTuple):
-    """A bias of the IMU stepped just before the frame at_ns: by (6,), accelerometer (m/s^2), then gyro (rad/s).
-
-    std (6,): how uncertain both are by then. Zero is what did not step. Of a bias that wanders, by is zero: it may have
-    stepped.
-    """
-
-    at_ns: int
-    by: FloatArray
-    std: FloatArray
-
-    def described(self, start_ns: int) -> str:
-        """What stepped by how much, and how long after the start."""
-        of_gyro = bool(np.any(self.by[3:]))
-        sensor, by, unit = ("gyro", self.by[3:], "rad/s") if of_gyro else ("accelerometer", self.by[:3], "m/s^2")
-        at_s = (self.at_ns - start_ns) / NANOSECONDS
-        return f"the {sensor}'s bias steps by {np.linalg.norm(by):.2g} {unit} at {at_s:.0f} s"
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from fusion import plots, report
 from fusion.config import RunConfig, to_toml
 from fusion.evaluation import Metrics
 from fusion.gnss import Georeference
-from fusion.imu import ImuCalibration
+from fusion.imu import BiasStep, ImuCalibration
 from fusion.measurements import Estimate, Mounting
 from fusion.placement import Placement, placement, refined_mounting
 from fusion_io.errors import LogError, UsageError
@@ -72,6 +72,12 @@ class Outcome:
     def mounting(self) -> Mounting | None:
         """How the IMU is mounted, as a back end has refined it, or None."""
         return refined_mounting(self.estimates.values())
+
+    @property
+    def bias_steps(self) -> list[BiasStep]:
+        """Those of the IMU that the calibration and a back end found."""
+        found = [step for each in self.estimates.values() for step in each.bias_steps]
+        return sorted([*self.calibration.bias_steps, *found], key=lambda step: step.at_ns)
 
     @cached_property
     def content(self) -> report.ReportContent:
@@ -206,6 +212,7 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
         "trajectories": {name: _values(outcome, name) for name in outcome.metrics},
         "at_end": {name: _at_end(each) for name, each in outcome.trajectories.items()},
         "calibration": _calibration(calibration, placement(calibration, outcome.mounting)),
+        "bias_steps": [_bias_step(step) for step in outcome.bias_steps if step.is_known],
         "front_end": {"scale_sigma": next((sigma[0] for sigma in told if sigma), None)},
         "gnss": None if outcome.georeference is None else _georeference(outcome.georeference),
         "timing": {**seconds, "total": total, "realtime_factor": outcome.duration_s / total},
@@ -226,6 +233,11 @@ def _calibration(found: ImuCalibration, known: Placement) -> dict[str, Any]:
         "used": found.used,
         "reason": found.reason,
     }
+
+
+def _bias_step(step: BiasStep) -> dict[str, Any]:
+    accelerometer, gyro = step.by[:3].tolist(), step.by[3:].tolist()
+    return {"stamp_ns": step.at_ns, "accelerometer_m_s2": accelerometer, "gyro_rad_s": gyro}
 
 
 def _write_frames(writer: LogWriter, outcome: Outcome) -> None:

@@ -33,8 +33,8 @@ from fusion.chain import ImuWindow, ImuWindows, chain, mean_rates, motions_of
 from fusion.config import PoseGraphConfig, Robust
 from fusion.evidence import graph_of
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
-from fusion.imu import ImuCalibration
-from fusion.measurements import BiasStep, Estimate, Measurements, Mounting
+from fusion.imu import WANDERS, BiasStep, ImuCalibration
+from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.pair_model import camera, inverse
 from fusion_io.errors import LogError
 from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
@@ -57,7 +57,7 @@ MIN_EIGENVALUE = 1e-9  # of a pair's correlation matrix: below, its covariance i
 
 MAX_ITERATIONS = 30
 FORGIVING_ITERATIONS = 2  # before anything is judged
-CONVERGED = 1e-4  # of what a step lowers the squares by: it moves nothing by more than a hundredth of its sigma
+CONVERGED = 1e-3  # of what a step lowers the squares by: it moves nothing by more than a thirtieth of its sigma
 SETTLED = 10.0  # the same, where the log is asked for what was assumed: all assumptions are at as much of a loss by it
 ANNEALING = 4.0  # of the kernel's width from step to step; by larger steps wrong loops drag good pairs out with them
 REJECTED_WEIGHT = 1e-4  # of a step whose pair is left out: no more than a hint, where nothing else is known
@@ -186,8 +186,10 @@ def _solve(
     georeference = tie.georeference(problem, solution) if tie else None
     told = None if problem.front_end_sigma == config.front_end_sigma(steps) else problem.front_end_sigma
     stepped = _bias_steps(problem, solution)
-    notes = [step.described(problem.stamps_ns[0]) for step in stepped if np.any(step.by)]
-    notes += ["the accelerometer's bias wanders: it is hardly believed"] if wandering else []
+    notes = [
+        f"{step} at {(step.at_ns - problem.stamps_ns[0]) / NANOSECONDS:.0f} s" for step in stepped if step.is_known
+    ]
+    notes += [WANDERS] if wandering else []
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
         trajectory_of(problem, solution),
@@ -378,11 +380,10 @@ def bias_walk(starts_ns: IntArray, calibration: ImuCalibration, config: PoseGrap
     They wander; where the calibration found that the gyro's stepped, it is as uncertain as at first.
     """
     walk = np.repeat([config.accelerometer_bias_walk, config.gyro_bias_walk], 3)
-    step = np.repeat([0.0, calibration.gyro_bias_std], 3)
-    at_ns = calibration.bias_steps_ns[:, None]
-    stepped = np.any((at_ns >= starts_ns[:-1]) & (at_ns < starts_ns[1:]), axis=0)
-    seconds = np.diff(starts_ns) / NANOSECONDS
-    return np.asarray(np.hypot(walk * np.sqrt(seconds)[:, None], step * stepped[:, None]))
+    variances = walk**2 * (np.diff(starts_ns) / NANOSECONDS)[:, None]
+    for step in calibration.bias_steps:
+        variances[(step.at_ns >= starts_ns[:-1]) & (step.at_ns < starts_ns[1:])] += step.std**2
+    return np.asarray(np.sqrt(variances))
 
 
 def _add_preintegrated(

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from fusion import events
 from fusion.chain import chain
 from fusion.events import Event
+from fusion.imu import BiasStep
 from fusion_io.records import NANOSECONDS, ImuSeries, PairEstimate, Trajectory
 
 SECONDS = 90.0
@@ -220,3 +221,17 @@ def test_next_to_nothing_is_no_reason_to_fail(truth: Trajectory) -> None:
 def test_chained_pairs_are_their_own_fused_motion(pairs: list[PairEstimate]) -> None:
     assert_allclose(events.deviations(pairs, chain(pairs)), 0.0, atol=1e-12)
     assert pairs[0].target_stamp_ns - pairs[0].source_stamp_ns == PERIOD_NS
+
+
+def test_steps_of_a_bias_are_events_of_a_second_and_wandering_one_of_all() -> None:
+    """Those that are known are named one by one."""
+    std = np.full(6, 0.1)
+    known = [BiasStep(START_NS + k * NANOSECONDS, np.array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0]), std) for k in (10, 20)]
+    unknown = [BiasStep(START_NS + k * NANOSECONDS, np.zeros(6), std) for k in range(1, 30)]
+    found = events.bias_steps([*known, *unknown], "/imu")
+    assert [event.kind for event in found] == [events.BIAS_STEP, events.BIAS_STEP, events.BIAS_WANDERS]
+    assert [event.duration_s for event in found] == [1.0, 1.0, 28.0]
+    assert [event.end_ns for event in found[:2]] == [step.at_ns for step in known]
+    assert "0.6 m/s^2" in found[0].text
+    assert all(event.is_fault for event in found)
+    assert not events.bias_steps([], "/imu")

@@ -11,7 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import config, output
 from fusion.evaluation import Metrics, evaluate
-from fusion.imu import ImuCalibration
+from fusion.imu import BiasStep, Change, ImuCalibration
+from fusion.measurements import Estimate
 from fusion_io.errors import LogError, UsageError
 from fusion_io.findings import Findings
 from fusion_io.reader import open_log
@@ -115,7 +116,9 @@ def test_a_run_leaves_these_files_and_no_others(tmp_path: Path, outcome: output.
 def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.Outcome) -> None:
     output.write_metrics(tmp_path, outcome, SECONDS)
     document = json.loads((tmp_path / "metrics.json").read_text())
-    assert document.keys() == {"schema", "log", "trajectories", "at_end", "calibration", "front_end", "gnss", "timing"}
+    assert document.keys() == {
+        *("schema", "log", "trajectories", "at_end", "calibration", "bias_steps", "front_end", "gnss", "timing")
+    }
     assert document["schema"] == 1
     assert document["log"] == {
         "path": str(outcome.log.path),
@@ -151,7 +154,24 @@ def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.O
         "used": True,
         "reason": "it agrees with the pairs",
     }
+    assert document["bias_steps"] == []
     assert document["timing"] == {**SECONDS, "total": 2.0, "realtime_factor": pytest.approx(0.55)}
+
+
+def test_metrics_json_has_all_steps_of_biases_that_are_known(tmp_path: Path, outcome: output.Outcome) -> None:
+    """Those of the calibration and those of the pose graph, in order of time; not that a bias wanders."""
+    accelerometer = BiasStep(2_000_000_000, np.array([0.5, 0.0, -0.5, 0.0, 0.0, 0.0]), np.zeros(6))
+    wanders = BiasStep(1_500_000_000, np.zeros(6), np.ones(6))
+    change = Change(1_065_000_000, 0, np.array([0.0, 0.02, 0.0]))
+    stepped = replace(
+        outcome,
+        calibration=replace(outcome.calibration, changes=[change]),
+        estimates={"posegraph": Estimate(_trajectory(1), "", bias_steps=[wanders, accelerometer])},
+    )
+    assert output.metrics_document(stepped, SECONDS)["bias_steps"] == [
+        {"stamp_ns": 1_000_000_000, "accelerometer_m_s2": [0.0, 0.0, 0.0], "gyro_rad_s": [0.0, 0.02, 0.0]},
+        {"stamp_ns": 2_000_000_000, "accelerometer_m_s2": [0.5, 0.0, -0.5], "gyro_rad_s": [0.0, 0.0, 0.0]},
+    ]
 
 
 def test_what_could_not_be_computed_is_null(outcome: output.Outcome) -> None:

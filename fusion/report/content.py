@@ -16,7 +16,7 @@ from fusion.evaluation import KITTI_SEGMENT_LENGTHS_M, Metrics
 from fusion.events import Event
 from fusion.extrapolation import Extrapolation, extrapolations
 from fusion.gnss import PlacedFixes
-from fusion.imu import ImuCalibration, on_camera_clock
+from fusion.imu import BiasStep, ImuCalibration, on_camera_clock
 from fusion.measurements import Mounting
 from fusion_io.errors import LogError
 from fusion_io.findings import Findings
@@ -47,9 +47,10 @@ class ReportContent:
 
     trajectories: by name, raw among them. segment_lengths_m: of t_rel and r_rel. series: what a back end estimated
     beside the poses, by its name; mounting: of the IMU, as a back end refined it; loops_used: which of the loops it
-    believed (M,). topics: the name of each role. warnings: counts by name, notes: a line for each. remarks: what the
-    back ends say, by name. fixes: GNSS positions, where the pose graph found out where the world is. levels: pairs
-    whose hypotheses are the motions after each level of the network. damage: a line for each fault of the file.
+    believed (M,). bias_steps: of the IMU. topics: the name of each role. warnings: counts by name, notes: a line for
+    each. remarks: what the back ends say, by name. fixes: GNSS positions, where the pose graph found out where the
+    world is. levels: pairs whose hypotheses are the motions after each level of the network. damage: a line for each
+    fault of the file.
     """
 
     title: str
@@ -65,6 +66,7 @@ class ReportContent:
     series: Mapping[str, EstimatorSeries] = field(default_factory=dict)
     loops: Sequence[PairEstimate] = ()
     loops_used: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    bias_steps: Sequence[BiasStep] = ()
     topics: Mapping[str, str] = field(default_factory=dict)
     warnings: Mapping[str, int] = field(default_factory=dict)
     notes: Sequence[str] = ()
@@ -137,6 +139,7 @@ class ReportContent:
         if self.calibration is not None:
             known = [event for event in (*shown, *jumps) if event.kind != events.IMU_GAP]
             yield from events.contradictions(self.calibration.faulty_ns, offset_s, known, topic)
+        yield from events.bias_steps(self.bias_steps, topic)
 
     def _camera_events(self) -> Iterator[Event]:
         frames = self.topic("image" if "image" in self.topics else "camera_info")
@@ -174,6 +177,7 @@ def content_of(outcome: Outcome) -> ReportContent:
         imu=outcome.imu,
         calibration=outcome.calibration,
         mounting=outcome.mounting,
+        bias_steps=outcome.bias_steps,
         topics=log.roles,
         warnings={**log.warnings, **outcome.findings.counts},
         notes=[*log.notes, *outcome.findings.notes],
