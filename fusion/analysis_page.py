@@ -30,7 +30,7 @@ EVENT_COLOURS = {
     events.MISSING_PAIRS: "#8c8c8c",
     events.WRONG_PAIR: "#e69f00",
     events.CONTRADICTION: "#d55e00",
-    events.BIAS_STEP: "#0b5345",
+    events.BIAS_STEP: "#7d3c98",
     events.BIAS_WANDERS: "#7d3c98",
     events.STAND_STILL: "#009e73",
 }

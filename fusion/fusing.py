@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from fusion import chain, ekf, online, posegraph
 from fusion.config import RunConfig
-from fusion.imu import WANDERS, BiasStep, ImuCalibration, in_camera_axes, on_camera_clock
+from fusion.imu import WANDERS, BiasStep, ImuCalibration, described, in_camera_axes, on_camera_clock
 from fusion.measurements import Estimate, Measurements
 from fusion_io.errors import FusionError
 from fusion_io.findings import Findings
@@ -78,9 +78,10 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
         estimates["posegraph"] = graph
     refined = known
     if graph is not None:
-        stepped = sum(step.is_known for step in graph.bias_steps)
-        of_graph.put("imu_bias_steps", stepped, f"steps of the IMU's biases, taken out of it: {stepped}")
-        of_graph.put("accelerometer_wanders", int(stepped < len(graph.bias_steps)), WANDERS)
+        stepped = described(graph.bias_steps, known.steps[0].source_stamp_ns)
+        note = f"steps of the IMU's biases, taken out of it: {len(stepped)} ({'; '.join(stepped)})"
+        findings.put("imu_bias_steps", len(stepped), note)
+        findings.put("accelerometer_wanders", int(len(stepped) < len(graph.bias_steps)), WANDERS)
         refined = replace(
             known,
             imu=known.imu and _without(graph.bias_steps, known.imu),
@@ -92,7 +93,12 @@ def fuse(known: Measurements, config: RunConfig, findings: Findings) -> dict[str
         refined = replace(known, imu=None, calibration=None)
     for name in asked[1:] if "posegraph" in asked else asked:
         if estimate := _attempt(name, refined, config, findings):
-            estimates[name] = replace(estimate, note=estimate.note + _by_the_graph(name, known, refined))
+            estimates[name] = replace(
+                estimate,
+                note=estimate.note + _by_the_graph(name, known, refined),
+                front_end_sigma=refined.front_end_sigma,
+                bias_steps=refined.bias_steps,
+            )
             if estimate.hindsight is not None:
                 estimates[f"{name}_smoothed"] = Estimate(
                     estimate.hindsight, "the EKF in hindsight: its loops move what was before them"
@@ -116,9 +122,10 @@ def _by_the_graph(name: str, known: Measurements, refined: Measurements) -> str:
     """What a back end took from the pose graph against what was known or set, to follow what else is said."""
     if known.imu is not None and refined.imu is None:
         return "; the pose graph had to leave the IMU out"
+    told = list(described(refined.bias_steps, known.steps[0].source_stamp_ns))
     if name == "ekf" and refined.front_end_sigma is not None:
-        return f"; scale errors have a sigma of {100 * refined.front_end_sigma[0]:.2g} %, as the pose graph found"
-    return ""
+        told.append(f"scale errors have a sigma of {100 * refined.front_end_sigma[0]:.2g} %")
+    return f"; {'; '.join(told)}, as the pose graph found" if told else ""
 
 
 def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findings) -> Estimate | None:

@@ -126,6 +126,11 @@ class BiasStep(NamedTuple):
         return f"the {sensor}'s bias steps by {np.linalg.norm(by):.2g} {unit}"
 
 
+def described(steps: Sequence[BiasStep], start_ns: int) -> list[str]:
+    """Those steps that are known, and how long after a start they were."""
+    return [f"{step} at {(step.at_ns - start_ns) / NANOSECONDS:.0f} s" for step in steps if step.is_known]
+
+
 @dataclass(frozen=True, slots=True)
 class ImuCalibration:
     """How an IMU relates to the camera, and whether it is used.

@@ -76,7 +76,7 @@ class Outcome:
     @property
     def bias_steps(self) -> list[BiasStep]:
         """Those of the IMU that the calibration and a back end found."""
-        found = [step for each in self.estimates.values() for step in each.bias_steps]
+        found = next((each.bias_steps for each in self.estimates.values() if each.bias_steps), ())
         return sorted([*self.calibration.bias_steps, *found], key=lambda step: step.at_ns)
 
     @cached_property
@@ -229,7 +229,7 @@ def _calibration(found: ImuCalibration, known: Placement) -> dict[str, Any]:
         "time_offset_std_s": known.time_offset_std_s,
         "lever_arm_m": None if known.lever_arm_m is None else known.lever_arm_m.tolist(),
         "lever_arm_std_m": None if known.lever_arm_std_m is None else known.lever_arm_std_m.tolist(),
-        "gyro_bias_rad_s": found.gyro_bias.tolist(),
+        "gyro_bias_rad_s": known.gyro_bias.tolist(),
         "used": found.used,
         "reason": found.reason,
     }

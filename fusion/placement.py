@@ -20,13 +20,15 @@ class Placement:
     rotation_imu_camera: v_imu = R v_camera, None where it is unknown. time_offset_s: t_imu = t_camera + offset.
     lever_arm_m (3,): where the IMU is, in the camera's axes; only a back end finds it. Standard deviations are None
     where a value was given and nothing refined it; rotation_std_rad, lever_arm_std_m (3,) are about and along the
-    camera's axes.
+    camera's axes. gyro_bias, gyro_bias_std (3,) rad/s: at first, in IMU axes.
     """
 
     rotation_imu_camera: Rotation | None
     rotation_std_rad: FloatArray | None
     time_offset_s: float
     time_offset_std_s: float | None
+    gyro_bias: FloatArray
+    gyro_bias_std: FloatArray
     lever_arm_m: FloatArray | None = None
     lever_arm_std_m: FloatArray | None = None
 
@@ -47,6 +49,8 @@ def placement(calibration: ImuCalibration, refined: Mounting | None) -> Placemen
             refined.rotation_std_rad,
             calibration.time_offset_s + refined.ahead_s,
             refined.ahead_std_s,
+            refined.gyro_bias,
+            refined.gyro_bias_std,
             refined.lever_arm_m,
             refined.lever_arm_std_m,
         )
@@ -56,6 +60,8 @@ def placement(calibration: ImuCalibration, refined: Mounting | None) -> Placemen
         None if given else calibration.rotation_std_rad,
         calibration.time_offset_s,
         calibration.time_offset_std_s or None,
+        calibration.gyro_bias,
+        np.full(3, calibration.gyro_bias_std),
     )
 
 

@@ -33,7 +33,7 @@ from fusion.chain import ImuWindow, ImuWindows, chain, mean_rates, motions_of
 from fusion.config import PoseGraphConfig, Robust
 from fusion.evidence import graph_of
 from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
-from fusion.imu import WANDERS, BiasStep, ImuCalibration
+from fusion.imu import WANDERS, BiasStep, ImuCalibration, described
 from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.pair_model import camera, inverse
 from fusion_io.errors import LogError
@@ -186,9 +186,7 @@ def _solve(
     georeference = tie.georeference(problem, solution) if tie else None
     told = None if problem.front_end_sigma == config.front_end_sigma(steps) else problem.front_end_sigma
     stepped = _bias_steps(problem, solution)
-    notes = [
-        f"{step} at {(step.at_ns - problem.stamps_ns[0]) / NANOSECONDS:.0f} s" for step in stepped if step.is_known
-    ]
+    notes = described(stepped, int(problem.stamps_ns[0]))
     notes += [WANDERS] if wandering else []
     others = (skips, loops, tie.factors) if tie else (skips, loops)
     return Estimate(
@@ -525,9 +523,10 @@ def _renew_velocities(problem: Problem, values: gtsam.Values) -> None:
 
 
 def _shows_scale(problem: Problem, config: PoseGraphConfig) -> bool:
-    """Whether how large scale errors are can be told: an IMU shows them, and they have had the time to change."""
+    """Whether how large scale errors are can be told: they had time to change, and an accelerometer sees it."""
     seconds = (problem.stamps_ns[-1] - problem.stamps_ns[0]) / NANOSECONDS
-    return problem.twists is not None and seconds > LEAST_CORRELATION_TIMES * config.pair_scale_correlation_s
+    believed = problem.twists is not None and config.accelerometer_noise < DOUBTFUL_NOISE
+    return believed and seconds > LEAST_CORRELATION_TIMES * config.pair_scale_correlation_s
 
 
 def _renew_assumptions(

@@ -74,6 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     combinations = settings_of(arguments.set, arguments.grid)
     path = log_file(arguments.run)
     log = open_log(path)
+    for line in log.damage:
+        print(f"warning: {line}", file=sys.stderr)
     base = recorded_configuration(log)
     configurations = [configured(base, settings) for settings in combinations]
     recorded = recorded_result(log) or _as_result(replay(log, {}, configured(base, {})), path)

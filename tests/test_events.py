@@ -1,7 +1,9 @@
 """Each kind of sensor fault is found where it is, by its name; a sound log has none."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from numpy.testing import assert_allclose
 from report_samples import PERIOD_NS, START_NS, pairs_of, simulate
 from scipy.spatial.transform import RigidTransform
 
-from fusion import events
+from fusion import analysis_page, events, report
 from fusion.chain import chain
 from fusion.events import Event
 from fusion.imu import BiasStep
@@ -235,3 +237,12 @@ def test_steps_of_a_bias_are_events_of_a_second_and_wandering_one_of_all() -> No
     assert "0.6 m/s^2" in found[0].text
     assert all(event.is_fault for event in found)
     assert not events.bias_steps([], "/imu")
+
+
+def test_every_kind_of_event_has_a_colour_in_both_pages() -> None:
+    """Without one it is not shaded in the report."""
+    kinds = [*events.FAULTS, events.STAND_STILL]
+    assert set(analysis_page.EVENT_COLOURS) == set(kinds)
+    css = (Path(report.__file__).parent / "report.css").read_text()
+    for kind in kinds:
+        assert re.search(rf"--{kind.lower().replace(' ', '-')}: #\w{{6}};", css), kind

@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import ModuleType
 from typing import Literal
 
+import fault_samples as faults
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -11,6 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from benchmarks.drives import EKF, POSE_GRAPH, simulate
 from fusion import ekf, fusing, online, posegraph
 from fusion.config import RunConfig
+from fusion.evaluation import evaluate
+from fusion.imu import calibrate
 from fusion.measurements import Measurements
 from fusion_io.errors import LogError
 from fusion_io.findings import Findings
@@ -70,6 +73,27 @@ def test_what_is_causal_is_told_how_large_the_errors_of_the_front_end_are(
     sigmas = [np.sqrt(np.trace(each.trajectory.covariances[-1, 3:, 3:])) for each in (told, assumed)]
     larger = sigmas[0] / sigmas[1]  # the way is as uncertain as its scale
     assert larger > 1.5 if scale > POSE_GRAPH.pair_scale_sigma else larger < 0.8
+
+
+@pytest.mark.parametrize("name", ["ekf", "posegraph_online"])
+def test_what_is_causal_is_told_of_steps_of_the_biases_and_says_so(name: str) -> None:
+    """It is the better for it, and who asks for the filter alone is told of them as well."""
+    log = faults.simulated(3, 25.0)
+    log = replace(log, imu=faults.accelerometer_bias_step(log.imu, 12.5, np.array([0.6, -0.3, 0.9])))
+    calibration = calibrate(log.pairs, log.imu, None, None)
+    known = fusing.measurements(log.pairs, log.imu, calibration, log.truth.stamps_ns, Findings())
+    config = RunConfig(backend="ekf") if name == "ekf" else RunConfig(backend="posegraph", online=True)
+    findings = Findings()
+    told = fusing.fuse(known, config, findings)[name]
+    assert findings.counts["imu_bias_steps"] == 1
+    [step] = told.bias_steps
+    assert f"{step} at 12 s" in told.note
+    assert told.note.endswith("as the pose graph found")
+    untold = ekf.solve(known, config.ekf) if name == "ekf" else online.solve(known, config.posegraph)
+    ate_m = [evaluate(each.trajectory, log.truth).ate_m for each in (told, untold)]
+    assert ate_m[0] is not None
+    assert ate_m[1] is not None
+    assert ate_m[0] < ate_m[1]
 
 
 def test_the_filter_uses_no_imu_that_the_pose_graph_had_to_leave_out() -> None:

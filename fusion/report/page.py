@@ -258,12 +258,13 @@ def _calibration(content: ReportContent) -> str:
     rows: list[tuple[str, str]] = []
     if (known := content.calibration) is not None:
         rows.append(("IMU", f"{'calibrated' if known.used else 'left out'}: {known.reason}"))
-        rows += _placement(placement(known, content.mounting))
+        best = placement(known, content.mounting)
+        rows += _placement(best)
         if content.mounting is not None:
             rows.append(("refined from", _moved(known, content.mounting)))
-        bias = ", ".join(f"{1e3 * part:.3f}" for part in known.gyro_bias)
-        estimated = f"{bias} mrad/s, sigma {1e3 * known.gyro_bias_std:.3f}"
-        rows.append(("gyro bias x, y, z", estimated if known.gyro_bias_std else "taken to be zero"))
+        bias, std = (", ".join(f"{1e3 * part:.3f}" for part in each) for each in (best.gyro_bias, best.gyro_bias_std))
+        estimated = f"{bias} mrad/s, sigma {std}"
+        rows.append(("gyro bias x, y, z", estimated if np.any(best.gyro_bias_std) else "taken to be zero"))
     rows += [(label(name), remark) for name, remark in content.remarks.items() if remark]
     return _pairs_table(rows)
 

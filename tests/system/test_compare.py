@@ -94,6 +94,18 @@ def test_a_damaged_log_is_compared_as_far_as_it_goes(folder: Path, tmp_path: Pat
     assert compare.main([str(tmp_path / "cut.mcap")]) == 3
 
 
+def test_a_replay_of_a_cut_run_says_so_and_ends_with_3(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The configuration and the pairs are at its front, so that something is left to be replayed."""
+    whole = (folder / "run.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) * 8 // 10])
+    assert replay.main([str(cut), "--set", "ekf.gyro_noise=5e-3"]) == 3
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert any("cut.mcap" in line and "cut or unfinished" in line for line in lines), lines
+
+
 def test_a_replay_with_unchanged_settings_gives_the_recorded_trajectories(folder: Path, tmp_path: Path) -> None:
     assert replay.main([str(folder), "--out", str(tmp_path)]) == 0
     for name in ("raw", "posegraph", "ekf"):
