@@ -24,7 +24,8 @@ from fusion_io.records import FloatArray
 ACCELEROMETER_STEP, GYRO_STEP, WANDERING = np.repeat([[1.0, 0.0], [0.0, 0.02], [0.3, 0.0]], 3, axis=1)
 LEAST_KNOTS = 3  # before a step, and after it
 # The gain is the logarithm of how many times likelier what was measured is by it. Of a step it is -1.5 at most in real
-# logs and 280 simulated ones of sound IMUs; a bias that wanders costs little where there are few knots.
+# logs and 280 simulated ones of sound IMUs whose first bias is right; a bias that wanders costs little where there are
+# few knots.
 LEAST_BY_STEP, LEAST_BY_WANDERING = 0.0, 3.0
 # Of what wandering would gain, what is enough for a step: it is simpler, and what it leaves is asked again.
 NEARLY_ALL = 0.95
