@@ -66,7 +66,9 @@ def _joined(
     rows_above: dict[int, tuple[int, int]],
 ) -> Joint:
     """A variable joined to its parents: R x + S p = d + noise."""
-    root_inverse, _ = dtrtri(conditional.R())
+    root_inverse, singular = dtrtri(conditional.R())
+    if singular:
+        raise np.linalg.LinAlgError("a variable that nothing determines")
     n = len(root_inverse)
     by_parents = -root_inverse @ conditional.S()
     crossed = by_parents @ of_parents

@@ -96,3 +96,11 @@ def test_rounding_does_not_grow_over_thousands_of_variables(backwards: bool) -> 
     expected = first**2 + np.arange(count) * step**2
     assert_allclose(variances, np.repeat(expected[:, None], 6, axis=1), rtol=1e-6, atol=1e-15)
     assert all(np.array_equal(found[k], found[k].T) for k in range(0, count, 100))
+
+
+def test_a_variable_that_nothing_determines_is_an_error() -> None:
+    """Rather than a covariance that is none."""
+    net = gtsam.GaussianBayesNet()
+    net.push_back(gtsam.GaussianConditional(0, np.zeros(2), np.array([[1.0, 0.5], [0.0, 0.0]])))
+    with pytest.raises(np.linalg.LinAlgError):
+        covariances(net, lambda key: [key])
