@@ -37,6 +37,7 @@ class Batch(ABC):
         self._keys = keys
         self._errors = np.zeros((len(keys), dimension))
         self._jacobians: list[FloatArray] = []
+        self._weighted = (self._errors, self._jacobians)
 
     @abstractmethod
     def _evaluate(self, values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
@@ -50,6 +51,13 @@ class Batch(ABC):
     def update(self, values: gtsam.Values) -> None:
         """Evaluate all factors; what GTSAM looks up from now on belongs to these values."""
         self._errors, self._jacobians = self._evaluate(values)
+        self.weigh(self.weights)
+
+    def weigh(self, weights: FloatArray) -> None:
+        """Give the factors other weights (N,)."""
+        self.weights = weights
+        roots = np.sqrt(weights)
+        self._weighted = roots[:, None] * self._errors, [roots[:, None, None] * each for each in self._jacobians]
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph) -> None:
         """Add the factors to a graph."""
@@ -62,12 +70,14 @@ class Batch(ABC):
         return gtsam.CustomFactor(noise, list(self._keys[row]), self._lookup(row))
 
     def _lookup(self, row: int) -> Callable[..., FloatArray]:
+        variables = range(len(self._keys[row]))
+
         def look_up(_: gtsam.CustomFactor, __: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-            root = np.sqrt(self.weights[row])
+            errors, by_variables = self._weighted
             if jacobians is not None:
-                for place in range(len(self._keys[row])):
-                    jacobians[place] = root * self._jacobians[place][row]
-            return np.asarray(root * self._errors[row])
+                for place in variables:
+                    jacobians[place] = by_variables[place][row]
+            return np.asarray(errors[row])
 
         return look_up
 
@@ -161,6 +171,14 @@ class WorldFactor(Batch):
         pose, by_pose, by_extrinsics = camera(first, mounted, self._twist, strayed[6])
         errors = -difference(pose, np.eye(4)[None])
         return errors / self._sigma, [by_pose / self._sigma, padded(by_extrinsics @ by_vector(strayed)) / self._sigma]
+
+
+class StillFactor(WorldFactor):
+    """The first camera stays where it is, whatever X(0) and E(0) are: a step does not move it, but to second order."""
+
+    def _evaluate(self, values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
+        errors, jacobians = super()._evaluate(values)
+        return np.zeros_like(errors), jacobians
 
 
 class GnssFactors(Batch):

@@ -39,13 +39,18 @@ def covariances(net: gtsam.GaussianBayesNet, wanted: Callable[[int], Sequence[in
     keys = [list(conditional.keys()) for conditional in conditionals]
     place = {of[0]: i for i, of in enumerate(keys)}
     nearest = [min(of[1:], key=place.__getitem__, default=None) for of in keys]
-    children = Counter(nearest)
+    named = [wanted(of[0]) for of in keys]
+    children: Counter[int | None] = Counter()  # that are wanted, or have such children themselves
+    for (key, *_), near, some in zip(keys, nearest, named, strict=True):
+        children[near] += bool(some or children[key])
 
     found: dict[int, FloatArray] = {}
     known: dict[int | None, Joint] = {None: Joint(np.zeros((0, 0)), {})}
-    for conditional, (key, *parents), near in zip(
-        reversed(conditionals), reversed(keys), reversed(nearest), strict=True
+    for conditional, (key, *parents), near, some in reversed(
+        list(zip(conditionals, keys, nearest, named, strict=True))
     ):
+        if not (some or children[key]):
+            continue
         above = known[near]
         joint = _joined(conditional, key, parents, above.of(parents), above.rows)
         children[near] -= 1
@@ -53,8 +58,8 @@ def covariances(net: gtsam.GaussianBayesNet, wanted: Callable[[int], Sequence[in
             del known[near]
         if children[key]:
             known[key] = joint
-        if named := wanted(key):
-            found[key] = joint.of(named)
+        if some:
+            found[key] = joint.of(some)
     return found
 
 

@@ -2,9 +2,9 @@
 
 Variables: the poses X of the IMU in the first camera's frame, its velocities V and biases B, the direction of gravity
 G, how it is mounted and what its clock reads E, and the lasting errors S of the front end, one state a second; with
-satellite positions also where on the earth the world is U, and where the antenna is L. While the solution is looked
-for, X(0) stands still; then the world is moved to the first camera, and X(0) tied to E, so that the covariances of the
-camera's poses are those relative to it.
+satellite positions also where on the earth the world is U, and where the antenna is L. At first X(0) stands still, then
+the first camera, to which E(0) ties it, so that the covariances of the camera's poses are those relative to it; in the
+end the world is moved there.
 Without an IMU the poses are those of the camera, and without loops or positions the solution is the raw trajectory.
 
 Preintegration: Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", 2017. Linear
@@ -32,7 +32,7 @@ from fusion.biases import Doubt
 from fusion.chain import ImuWindow, ImuWindows, chain, mean_rates, motions_of
 from fusion.config import PoseGraphConfig, Robust
 from fusion.evidence import graph_of
-from fusion.factors import NO_KNOT, Batch, PairFactors, WorldFactor, by_vector, extrinsics, padded, poses_of
+from fusion.factors import NO_KNOT, Batch, PairFactors, StillFactor, by_vector, extrinsics, padded, poses_of
 from fusion.imu import WANDERS, BiasStep, ImuCalibration, described
 from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.pair_model import camera, inverse
@@ -484,11 +484,13 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
             batch.update(values)
         if iteration == FORGIVING_ITERATIONS:
             _renew_velocities(problem, values)
+            _tie_to_first_camera(problem, values)
             width = max(batch.squared.max(initial=0.0) / gate for batch, gate in zip(judged, gates, strict=True))
         if iteration >= FORGIVING_ITERATIONS:
             width = _reweigh(judged, gates, width, config.robust)
         linear = problem.graph.linearize(values)
-        step = _eliminated(linear.eliminateMultifrontal, order, problem.tied_up).optimize()
+        net = _eliminated(linear.eliminateSequential, order, problem.tied_up)
+        step = net.optimize()
         before, lowered = lowered, 2.0 * (linear.error(values.zeroVectors()) - linear.error(step))
         point, values = values, values.retract(step)
         if iteration >= FORGIVING_ITERATIONS and width <= 1.0:
@@ -501,10 +503,9 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
                 break
     if not np.all(np.isfinite(poses_of(values))):
         raise RuntimeError("the solution is not finite")
-    _make_first_camera_the_world(problem, values)
+    moved = _make_first_camera_the_world(problem, values)
     for batch in problem.batches:
         batch.update(values)
-    net = _eliminated(problem.graph.linearize(values).eliminateSequential, order, problem.tied_up)
     mounted = [E(0)] if values.exists(E(0)) else []
 
     def wanted(key: int) -> list[int] | None:
@@ -512,7 +513,11 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
         kind = chr(gtsam.Symbol(key).chr())
         return [key, *mounted] if kind in "xl" else [key] if kind in "bseu" else None
 
-    return Solution(values, marginals.covariances(net, wanted))
+    covariances = marginals.covariances(net, wanted)
+    if U(0) in covariances:  # the only one of these variables that is perturbed in the axes of the world
+        turned = gtsam.Pose3(moved).AdjointMap()
+        covariances[U(0)] = turned @ covariances[U(0)] @ turned.T
+    return Solution(values, covariances)
 
 
 def _renew_velocities(problem: Problem, values: gtsam.Values) -> None:
@@ -597,13 +602,24 @@ def _between_knots(
         key = order.at(place)
         (inner if key in gone else rest).push_back(key)
     _, reduced = _eliminated(others.eliminatePartialSequential, inner, problem.tied_up)
+    if problem.tied_up:  # what is best for all frames takes three times as long for the rest
+        rest = gtsam.Ordering.ColamdGaussianFactorGraph(graph_of(reduced, (linear.at(row) for row in sorted(assumed))))
     return reduced, rest
 
 
-def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> None:
-    """Move the world, which changes no error, and let X(0) depend on E(0) as the first camera does not."""
+def _tie_to_first_camera(problem: Problem, values: gtsam.Values) -> None:
+    """Let the first camera stand still instead of X(0), which then depends on E(0)."""
+    if problem.twists is not None:  # X(0) is the first camera otherwise
+        still = StillFactor(problem.T_camera_imu, problem.twists[:1], FIRST_POSE_SIGMA)
+        still.update(values)
+        problem.batches.append(still)
+        problem.graph.replace(0, still.factor(0))
+
+
+def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> FloatArray:
+    """Move the world, which changes no error; returns the pose (4, 4) of what was the world in what is it now."""
     if problem.twists is None:
-        return  # it is so already
+        return np.eye(4)  # it is so already
     moved = inverse(cameras(problem, values)[0][0])
     poses, velocities = moved @ poses_of(values), gtsam.utilities.extractVectors(values, "v") @ moved[:3, :3].T
     for k, (pose, velocity) in enumerate(zip(poses, velocities, strict=True)):
@@ -612,9 +628,7 @@ def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> None
     values.update(G(0), gtsam.Unit3(moved[:3, :3] @ values.atUnit3(G(0)).point3()))
     if values.exists(U(0)):
         values.update(U(0), gtsam.Pose3(values.atPose3(U(0)).matrix() @ inverse(moved)))
-    world = WorldFactor(problem.T_camera_imu, problem.twists[:1], FIRST_POSE_SIGMA)
-    problem.batches.append(world)
-    problem.graph.replace(0, world.factor(0))
+    return moved
 
 
 def _eliminated(eliminate: Callable[..., Tree], order: gtsam.Ordering, tied_up: bool) -> Tree:
@@ -654,11 +668,11 @@ def _reweigh(batches: Sequence[Batch], gates: Sequence[float], width: float, rob
     for batch, gate in zip(batches, gates, strict=True):
         beyond = batch.squared / gate
         if robust == "huber":
-            batch.weights = 1.0 / np.sqrt(np.maximum(beyond, 1.0))
+            batch.weigh(1.0 / np.sqrt(np.maximum(beyond, 1.0)))
         elif robust == "gnc" and width > 1.0:
-            batch.weights = np.maximum((width / (width + beyond)) ** 2, batch.least_weight)
+            batch.weigh(np.maximum((width / (width + beyond)) ** 2, batch.least_weight))
         elif robust == "gnc":
-            batch.weights = np.where(beyond > 1.0, batch.least_weight, 1.0)
+            batch.weigh(np.where(beyond > 1.0, batch.least_weight, 1.0))
     return width / ANNEALING if robust == "gnc" and width > 1.0 else min(width, 1.0)
 
 
@@ -691,7 +705,6 @@ def series_of(problem: Problem, solution: Solution, pairs: PairFactors) -> Estim
     if problem.twists is not None:
         biases[:, :6] = [values.atConstantBias(B(j)).vector() for j in problem.knots.tolist()]
         biases[:, 6:] = _std_at(problem, solution, B)
-    pairs.update(values)
     shown = np.full((frames, 7), np.nan)
     shown[1:] = np.column_stack([pairs.residual, pairs.squared])
     return EstimatorSeries(

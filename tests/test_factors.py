@@ -165,7 +165,7 @@ def test_what_gtsam_adds_up_is_the_mahalanobis_distance_times_the_weight() -> No
     expected = xi @ np.linalg.solve(covariance, xi)
     assert batch.squared[0] == pytest.approx(expected, rel=1e-3)
     assert 2 * graph.error(values) == pytest.approx(batch.squared[0], rel=1e-12)
-    batch.weights[:] = 0.25
+    batch.weigh(np.array([0.25]))
     assert 2 * graph.error(values) == pytest.approx(0.25 * batch.squared[0], rel=1e-12)
     assert_allclose(_linear(batch, values)[1][0], 0.5 * _unweighted(batch, values), rtol=1e-12)
 
