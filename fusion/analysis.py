@@ -205,8 +205,8 @@ class _Seen:
             self.events += events.wrong_pairs(pairs, topic)
             gyro = log.roles.get("imu") or log.roles.get("gyro")
             if gyro and len(imu):
-                self.events += events.clock_jumps(imu, pairs, gyro)
                 self.calibration = calibrate(pairs, imu, log.mounting(), None)
+                self.events += events.clock_jumps(imu, pairs, gyro, self.calibration)
         self.results = {name: _result(log, name, truth) for name in log.trajectory_names}
         self.revisits = _revisits(log, truth, pairs)
 

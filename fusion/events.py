@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2
 
 from fusion import clocks, sensors
-from fusion.imu import WANDERS, BiasStep
+from fusion.imu import WANDERS, BiasStep, ImuCalibration
 from fusion.sensors import MAD_TO_STD, runs
 from fusion_io.records import NANOSECONDS, FloatArray, ImuSeries, IntArray, PairEstimate, Trajectory
 from fusion_io.words import counted
@@ -214,15 +214,17 @@ def standing(trajectory: Trajectory, topic: str) -> list[Event]:
 # ---------------------------------------------------------------------------------------------- IMU and pairs
 
 
-def clock_jumps(imu: ImuSeries, pairs: Sequence[PairEstimate], topic: str) -> list[Event]:
+def clock_jumps(
+    imu: ImuSeries, pairs: Sequence[PairEstimate], topic: str, calibration: ImuCalibration | None = None
+) -> list[Event]:
     """Where the clock of the IMU jumps against the camera's, on the camera's clock.
 
-    Both tell how fast they turn, which needs no mounting. The offset that makes them agree best is found in windows;
-    where it changes for good, the stamps of one of them jumped. A forward jump looks like a gap, a backward one like
-    samples out of order: the offset is what tells it from those.
+    As the calibration found them, if it did. Otherwise both tell how fast they turn, which needs no mounting: where the
+    offset that makes them agree best changes for good, the stamps of one of them jumped. A forward jump looks like a
+    gap, a backward one like samples out of order: the offset is what tells it from those.
     """
     events = []
-    for jump in clocks.jumps(imu, pairs):
+    for jump in (calibration.clock_jumps if calibration else []) or clocks.jumps(imu, pairs):
         text = f"the clock of the IMU jumps by {jump.by_s:+.2f} s against the camera's"
         events.append(Event(jump.at_ns, jump.at_ns + NANOSECONDS // 2, CLOCK_JUMP, topic, text))
     return events

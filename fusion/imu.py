@@ -54,6 +54,13 @@ MAX_CLIPPED_SHARE = 0.5
 
 # Stamps and pairs tell when a clock jumped to about so well.
 JUMP_GUARD_S = 1.0
+MAX_SMALL_JUMPS = 3  # of a clock
+SMALL_JUMP_PRIOR_S, STEP_PRIOR = 1.0, 0.1  # by about so much a clock jumps, and beside it the gyro's bias steps (rad/s)
+SMALL_JUMP_EDGE_S = 5.0  # before a jump, and after it
+# How many times likelier (logarithm) a jump has to make what was seen. Sound logs and those with other faults have at
+# most 5.5 for one; a jump of 50 ms in 25 s has 7 or more, one of 0.1 s 19.
+LEAST_BY_JUMP = 6.0
+JUMP_CONVERGED_S = 1e-3
 
 # A gyro's bias steps where the means of batches before and after differ by more than their scatter explains.
 MAX_BIAS_STEPS = 3
@@ -85,6 +92,7 @@ WHITENING_ORDER = 5
 CLIP = 4.0  # standard deviations
 CAUCHY = 2.385  # standard deviations; 95 % efficient on Gaussian errors (Holland and Welsch, 1977)
 MAD_TO_STD = 1.4826
+PRIOR_STD = np.repeat([ROTATION_PRIOR_RAD, GYRO_BIAS_PRIOR, TIME_OFFSET_PRIOR_S], [3, 3, 1])
 ITERATIONS = 30
 CONVERGED = 1e-9
 
@@ -164,6 +172,17 @@ class ImuCalibration:
         return np.asarray((at_ns - jumped - offset_ns)[stepped])
 
     @property
+    def clock_jumps(self) -> list[clocks.Jump]:
+        """Where the clock jumped, in order of time."""
+        found, ahead_ns = [], round(self.time_offset_s * NANOSECONDS)
+        for change in self.changes:
+            after_ns = ahead_ns + change.clock_ns
+            if change.clock_ns:
+                found.append(clocks.Jump(change.at_ns - ahead_ns, ahead_ns / NANOSECONDS, after_ns / NANOSECONDS))
+            ahead_ns = after_ns
+        return found
+
+    @property
     def bias_steps(self) -> list[BiasStep]:
         """Those steps; they are taken out of the samples on the camera's clock."""
         biases = [change.bias for change in self.changes if np.any(change.bias)]
@@ -202,22 +221,19 @@ def calibrate(
     if len(imu) < MIN_PAIRS:
         return left_out("its gyro or accelerometer hangs, or is at the end of its range")
     changes, doubtful_ns = _clock_jumps(imu, pairs)
-    imu = _unchanged(_outside(imu, doubtful_ns), changes)
-    gyro, turns = _Gyro(imu), _turns(pairs, int(imu.stamps_ns[0]))
-    offset_s, correlation = _correlate(gyro, turns) if time_offset_s is None else (time_offset_s, 1.0)
-    covered = gyro.measured(turns.source_s + offset_s, turns.target_s + offset_s)
-    if covered.sum() < MIN_PAIRS:
-        return left_out(f"it measured {covered.sum()} pairs from start to end, and {MIN_PAIRS} are needed")
-    if covered.mean() < MIN_COVERAGE:
-        return left_out(f"it measured only {covered.mean():.0%} of the pairs")
-    if correlation < MIN_CORRELATION:
-        return left_out(f"its angular rates do not follow those of the pairs (correlation {correlation:.2f} at best)")
-    if time_offset_s is None and abs(offset_s) >= MAX_TIME_OFFSET_S:
-        return left_out(f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's")
-
     estimate_offset = time_offset_s is None
-    fit = _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=estimate_offset)
-    fit, steps, bias_std = _without_bias_steps(imu, fit, rotation, estimate_offset=estimate_offset)
+    for _ in range(MAX_SMALL_JUMPS + 1):
+        good = _unchanged(_outside(imu, doubtful_ns), changes)
+        fitted = _fitted(good, pairs, rotation, time_offset_s)
+        if isinstance(fitted, str):
+            return left_out(fitted)
+        fit, steps, bias_std = _without_bias_steps(good, fitted, rotation, estimate_offset=estimate_offset)
+        jump = _small_jump(_Gyro(_unchanged(good, steps)), fit, rotation, estimate_offset=estimate_offset)
+        if jump is None:
+            break
+        at_s, by_s = jump
+        at_ns = _as_recorded(int(good.stamps_ns[0]) + round((at_s + fit.time_offset_s) * NANOSECONDS), changes)
+        changes, doubtful_ns = _with_jump(changes, doubtful_ns, at_ns, round(by_s * NANOSECONDS))
     steps = [step._replace(at_ns=_as_recorded(step.at_ns, changes)) for step in steps]
     changes = sorted([*changes, *steps], key=lambda change: change.at_ns)
     learned = any(pair.winner >= 0 for pair in pairs)
@@ -226,7 +242,7 @@ def calibrate(
     if learned:  # a few percent of a lasting turn look like a bias
         rate = np.mean(fit.turns.turned, axis=0) / np.mean(fit.turns.target_s - fit.turns.source_s)
         gyro_bias_std = float(np.hypot(gyro_bias_std, MAX_SCALE_ERROR_LEARNED * np.linalg.norm(rate)))
-    contradicted = [_as_recorded(at_ns, changes) for at_ns in (fit.faulty_intervals() + imu.stamps_ns[0]).ravel()]
+    contradicted = [_as_recorded(at_ns, changes) for at_ns in (fit.faulty_intervals() + good.stamps_ns[0]).ravel()]
     faulty_ns = np.concatenate([not_measured_ns, doubtful_ns, np.array(contradicted, dtype=np.int64).reshape(-1, 2)])
     return ImuCalibration(
         fit.rotation_imu_camera,
@@ -361,15 +377,26 @@ def _not_measured(imu: ImuSeries) -> IntArray:
 
 def _clock_jumps(imu: ImuSeries, pairs: Sequence[PairEstimate]) -> tuple[list[Change], IntArray]:
     """Where the IMU's clock jumped, and the intervals (M, 2) about it whose samples may be of before or after."""
-    changes, doubtful = [], []
-    guard_ns = round(JUMP_GUARD_S * NANOSECONDS)
+    changes: list[Change] = []
+    doubtful_ns = np.zeros((0, 2), dtype=np.int64)
     for jump in clocks.jumps(imu, pairs):
         at_ns = jump.at_ns + round(jump.before_s * NANOSECONDS)
-        by_ns = round(jump.by_s * NANOSECONDS)
-        # A clock that goes back repeats its stamps, of which a reader keeps one or the other.
-        doubtful.append((at_ns + min(by_ns, 0) - guard_ns, at_ns + max(by_ns, 0) + guard_ns))
-        changes.append(Change(at_ns, by_ns, np.zeros(3)))
-    return changes, np.array(doubtful, dtype=np.int64).reshape(-1, 2)
+        changes, doubtful_ns = _with_jump(changes, doubtful_ns, at_ns, round(jump.by_s * NANOSECONDS))
+    return changes, doubtful_ns
+
+
+def _with_jump(
+    changes: Sequence[Change], doubtful_ns: IntArray, at_ns: int, by_ns: int
+) -> tuple[list[Change], IntArray]:
+    """The same with one more jump of the clock; what was found near it before was a part of it."""
+    near = [abs(change.at_ns - at_ns) < SMALL_JUMP_EDGE_S * NANOSECONDS for change in changes]
+    by_ns += sum(change.clock_ns for change, part in zip(changes, near, strict=True) if part)
+    changes = [change for change, part in zip(changes, near, strict=True) if not part]
+    guard_ns = round(JUMP_GUARD_S * NANOSECONDS)
+    # A clock that goes back repeats its stamps, of which a reader keeps one or the other.
+    about_ns = (at_ns + min(by_ns, 0) - guard_ns, at_ns + max(by_ns, 0) + guard_ns)
+    more = sorted([*changes, Change(at_ns, by_ns, np.zeros(3))], key=lambda change: change.at_ns)
+    return more, np.vstack([doubtful_ns, np.array([about_ns], dtype=np.int64)])
 
 
 def _unchanged(imu: ImuSeries, changes: Sequence[Change]) -> ImuSeries:
@@ -396,13 +423,39 @@ def _as_recorded(at_ns: int, changes: Sequence[Change]) -> int:
 # ------------------------------------------------------------------------------------------------------ estimation
 
 
+class _White(NamedTuple):
+    """(1) over N pairs, whitened and weighted: what each adds to the gradient, and to the information.
+
+    by_residual (N, 7), by_jacobian (N, 7, 7), of all parameters.
+    """
+
+    by_residual: FloatArray
+    by_jacobian: FloatArray
+
+    @classmethod
+    def of(cls, residual: FloatArray, jacobian: FloatArray) -> _White:
+        """From residuals (N, 3) and their Jacobian (N, 3, 7)."""
+        residual, jacobian = _whitened(residual, jacobian)
+        weight = 1.0 / (1.0 + (residual / CAUCHY) ** 2)
+        weighted = weight[:, :, None] * jacobian
+        return cls(
+            np.einsum("nai,na->ni", weighted, residual), np.einsum("nai,naj->nij", weighted, jacobian, optimize=True)
+        )
+
+    @property
+    def information(self) -> FloatArray:
+        """(7, 7) of all parameters, their priors included."""
+        return np.asarray(self.by_jacobian.sum(axis=0) + np.diag(PRIOR_STD**-2.0))
+
+
 @dataclass(frozen=True, slots=True)
 class _Fit:
     """The solution of (1) over N pairs.
 
     std (7,): standard deviations of rotation (about the camera's axes), bias and offset, zero for what is given.
     moved_s: from the offset where the refinement began. predicted (N, 3): turning in camera axes by the gyro.
-    sigma (3,): robust standard deviation of the residual per axis.
+    sigma (3,): robust standard deviation of the residual per axis. white: (1) as it was solved at last, free (7,):
+    which parameters were estimated.
     """
 
     rotation_imu_camera: Rotation
@@ -413,6 +466,8 @@ class _Fit:
     turns: _Turns
     predicted: FloatArray
     sigma: FloatArray
+    white: _White
+    free: NDArray[np.bool_]
 
     @property
     def deviation(self) -> FloatArray:
@@ -454,6 +509,24 @@ class _Fit:
         return float(scale), float(std)
 
 
+def _fitted(
+    imu: ImuSeries, pairs: Sequence[PairEstimate], rotation: Rotation | None, time_offset_s: float | None
+) -> _Fit | str:
+    """The solution of (1), from a closed form; or why that cannot be."""
+    gyro, turns = _Gyro(imu), _turns(pairs, int(imu.stamps_ns[0]))
+    offset_s, correlation = _correlate(gyro, turns) if time_offset_s is None else (time_offset_s, 1.0)
+    covered = gyro.measured(turns.source_s + offset_s, turns.target_s + offset_s)
+    if covered.sum() < MIN_PAIRS:
+        return f"it measured {covered.sum()} pairs from start to end, and {MIN_PAIRS} are needed"
+    if covered.mean() < MIN_COVERAGE:
+        return f"it measured only {covered.mean():.0%} of the pairs"
+    if correlation < MIN_CORRELATION:
+        return f"its angular rates do not follow those of the pairs (correlation {correlation:.2f} at best)"
+    if time_offset_s is None and abs(offset_s) >= MAX_TIME_OFFSET_S:
+        return f"its clock is more than {MAX_TIME_OFFSET_S} s off the camera's"
+    return _refine(gyro, turns.where(covered), rotation, offset_s, estimate_offset=time_offset_s is None)
+
+
 def _correlate(gyro: _Gyro, turns: _Turns) -> tuple[float, float]:
     """The time offset at which the magnitudes of the angular rates correlate best, and that correlation.
 
@@ -487,28 +560,34 @@ def _wahba(gyro_turned: FloatArray, turned: FloatArray) -> Rotation:
     return rotation
 
 
-def _refine(gyro: _Gyro, turns: _Turns, rotation: Rotation | None, offset_s: float, *, estimate_offset: bool) -> _Fit:
-    """Robust generalised least squares on (1), with weak priors; rotation None is estimated from the closed form."""
+def _refine(
+    gyro: _Gyro,
+    turns: _Turns,
+    rotation: Rotation | None,
+    offset_s: float,
+    *,
+    estimate_offset: bool,
+    ahead_s: FloatArray | float = 0.0,
+) -> _Fit:
+    """Robust generalised least squares on (1), with weak priors; rotation None is estimated from the closed form.
+
+    ahead_s (N,): by how much more than by the offset the gyro's clock is ahead during each pair.
+    """
     source_s, target_s, turned = turns
     seconds = (target_s - source_s)[:, None]
     start = rotation or _wahba(gyro.turned(source_s + offset_s, target_s + offset_s), turned)
     free = np.repeat([rotation is None, True, estimate_offset], [3, 3, 1])
-    prior_std = np.repeat([ROTATION_PRIOR_RAD, GYRO_BIAS_PRIOR, TIME_OFFSET_PRIOR_S], [3, 3, 1])
     solution, covariance = np.zeros(7), np.zeros((7, 7))  # the solution is relative to the start
     to_camera = start.inv()
     for _ in range(ITERATIONS):
-        from_s, to_s = source_s + offset_s + solution[6], target_s + offset_s + solution[6]
+        from_s, to_s = (at_s + offset_s + ahead_s + solution[6] for at_s in (source_s, target_s))
         predicted = to_camera.apply(gyro.turned(from_s, to_s) - solution[BIAS] * seconds)
         by_rotation = np.cross(np.eye(3), predicted[:, None, :]).swapaxes(1, 2)  # d/dx Exp(x) p = -[p]
         by_bias = -seconds[:, :, None] * to_camera.as_matrix()
         by_offset = to_camera.apply(gyro.rate(to_s) - gyro.rate(from_s))[:, :, None]
-        jacobian = np.concatenate([by_rotation, by_bias, by_offset], axis=2)[:, :, free]
-        residual, jacobian = _whitened(turned - predicted, jacobian)
-
-        weight = 1.0 / (1.0 + (residual / CAUCHY) ** 2)
-        information = np.einsum("nai,na,naj->ij", jacobian, weight, jacobian) + np.diag(prior_std[free] ** -2.0)
-        gradient = np.einsum("nai,na,na->i", jacobian, weight, residual) - solution[free] / prior_std[free] ** 2
-        covariance[np.ix_(free, free)] = np.linalg.inv(information)
+        white = _White.of(turned - predicted, np.concatenate([by_rotation, by_bias, by_offset], axis=2))
+        gradient = white.by_residual.sum(axis=0)[free] - solution[free] / PRIOR_STD[free] ** 2
+        covariance[np.ix_(free, free)] = np.linalg.inv(white.information[np.ix_(free, free)])
         step = covariance[:, free] @ gradient
         solution += step
         to_camera = Rotation.from_rotvec(step[ROTATION]) * to_camera
@@ -523,6 +602,8 @@ def _refine(gyro: _Gyro, turns: _Turns, rotation: Rotation | None, offset_s: flo
         turns=turns,
         predicted=predicted,
         sigma=_robust_std(turned - predicted),
+        white=white,
+        free=free,
     )
 
 
@@ -559,6 +640,51 @@ def _without_bias_steps(
         imu = _unchanged(imu, steps[-1:])
         fit = _refine(_Gyro(imu), fit.turns, rotation, fit.time_offset_s, estimate_offset=estimate_offset)
     return fit, steps, std
+
+
+def _small_jump(
+    gyro: _Gyro, fit: _Fit, rotation: Rotation | None, *, estimate_offset: bool
+) -> tuple[float, float] | None:
+    """When the gyro's clock jumped ahead (s, camera clock), and by how much (s); None where that is not likely."""
+    start_s = fit.turns.source_s
+    inside = np.flatnonzero((start_s - start_s[0] > SMALL_JUMP_EDGE_S) & (start_s[-1] - start_s > SMALL_JUMP_EDGE_S))
+    if not len(inside):
+        return None
+    gained, by_s = _jumps_before(fit, inside)
+    best = int(np.argmax(gained))
+    if gained[best] < LEAST_BY_JUMP:
+        return None
+    row, jumped_s, step_s = inside[best], 0.0, float(by_s[best])
+    after = np.arange(len(start_s)) >= row
+    for _ in range(ITERATIONS):  # a step is what (1) shows of a jump where it is linear, less for outliers
+        jumped_s += step_s
+        offset_s = fit.time_offset_s
+        ahead_s = jumped_s * after
+        fit = _refine(gyro, fit.turns, rotation, offset_s, estimate_offset=estimate_offset, ahead_s=ahead_s)
+        step_s = float(_jumps_before(fit, np.array([row]))[1][0])
+        if abs(step_s) < JUMP_CONVERGED_S:
+            break
+    return float(start_s[row]), jumped_s
+
+
+def _jumps_before(fit: _Fit, rows: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """How much likelier, in its logarithm, a jump of the clock before some pairs (M,) is than none, and by what (s).
+
+    A generalised likelihood ratio of (1) (Willsky and Jones, 1976), all other parameters being free, and the gyro's
+    bias to step there, too, so that such a step does not pass for a jump.
+    """
+    own = np.r_[BIAS, OFFSET]
+    of_residual, of_jacobian = (
+        np.cumsum(each[::-1], axis=0)[::-1][rows] for each in (fit.white.by_residual, fit.white.by_jacobian)
+    )
+    with_free = of_jacobian[:, own][:, :, fit.free]
+    unknown = np.linalg.inv(fit.white.information[np.ix_(fit.free, fit.free)])
+    information = of_jacobian[:, own][:, :, own] - with_free @ unknown @ with_free.swapaxes(1, 2)
+    information += np.diag(np.repeat([STEP_PRIOR, SMALL_JUMP_PRIOR_S], [3, 1]) ** -2.0)
+    gradient = of_residual[:, own, None]
+    both, step = np.linalg.solve(information, gradient), np.linalg.solve(information[:, :3, :3], gradient[:, :3])
+    gained = 0.5 * (np.sum(gradient * both, axis=(1, 2)) - np.sum(gradient[:, :3] * step, axis=(1, 2)))
+    return np.asarray(gained), np.asarray(both[:, 3, 0])
 
 
 def _bias_step(fit: _Fit) -> tuple[float, FloatArray, float] | None:

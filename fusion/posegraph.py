@@ -484,7 +484,6 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
             batch.update(values)
         if iteration == FORGIVING_ITERATIONS:
             _renew_velocities(problem, values)
-            _tie_to_first_camera(problem, values)
             width = max(batch.squared.max(initial=0.0) / gate for batch, gate in zip(judged, gates, strict=True))
         if iteration >= FORGIVING_ITERATIONS:
             width = _reweigh(judged, gates, width, config.robust)
@@ -499,8 +498,15 @@ def minimise(problem: Problem, config: PoseGraphConfig) -> Solution:
             if asking and ahead < SETTLED:
                 asking = _renew_assumptions(problem, point, linear, order, config)
                 lowered = 0.0
+                if not asking:  # not before: E(0) still moved far, and with it all that hangs on it
+                    _tie_to_first_camera(problem, values)
             elif not asking and ahead < CONVERGED:
                 break
+    if asking:  # it has not settled
+        _tie_to_first_camera(problem, values)
+        for batch in problem.batches:
+            batch.update(values)
+        net = _eliminated(problem.graph.linearize(values).eliminateSequential, order, problem.tied_up)
     if not np.all(np.isfinite(poses_of(values))):
         raise RuntimeError("the solution is not finite")
     moved = _make_first_camera_the_world(problem, values)
@@ -609,11 +615,11 @@ def _between_knots(
 
 def _tie_to_first_camera(problem: Problem, values: gtsam.Values) -> None:
     """Let the first camera stand still instead of X(0), which then depends on E(0)."""
-    if problem.twists is not None:  # X(0) is the first camera otherwise
-        still = StillFactor(problem.T_camera_imu, problem.twists[:1], FIRST_POSE_SIGMA)
-        still.update(values)
-        problem.batches.append(still)
-        problem.graph.replace(0, still.factor(0))
+    assert problem.twists is not None
+    still = StillFactor(problem.T_camera_imu, problem.twists[:1], FIRST_POSE_SIGMA)
+    still.update(values)
+    problem.batches.append(still)
+    problem.graph.replace(0, still.factor(0))
 
 
 def _make_first_camera_the_world(problem: Problem, values: gtsam.Values) -> FloatArray:

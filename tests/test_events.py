@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 from fusion import analysis_page, events, report
 from fusion.chain import chain
 from fusion.events import Event
-from fusion.imu import BiasStep
+from fusion.imu import BiasStep, calibrate
 from fusion_io.records import NANOSECONDS, ImuSeries, PairEstimate, Trajectory
 
 SECONDS = 90.0
@@ -128,6 +128,16 @@ def test_a_clock_jump_is_found_with_its_size_and_sign(imu: ImuSeries, pairs: lis
     assert [event.kind for event in found] == [events.CLOCK_JUMP]
     assert_allclose(_spans(found)[0][0], 45.0, atol=1.0)
     assert_allclose(float(found[0].text.split(" by ")[1].split(" s ")[0]), jump_s, atol=0.05)
+
+
+def test_of_clock_jumps_the_calibration_knows_best(imu: ImuSeries, pairs: list[PairEstimate]) -> None:
+    """It finds such as are too small to be seen without the mounting."""
+    stamps = imu.stamps_ns + np.where(_at(imu) >= 45.0, NANOSECONDS // 20, 0)
+    jumped = replace(imu, stamps_ns=stamps)
+    assert not events.clock_jumps(jumped, pairs, "/imu")
+    (found,) = events.clock_jumps(jumped, pairs, "/imu", calibrate(pairs, jumped, None, None))
+    assert_allclose(_spans([found])[0][0], 45.0, atol=2.0)
+    assert "jumps by +0.05 s" in found.text
 
 
 def test_a_gap_alone_is_no_clock_jump(imu: ImuSeries, pairs: list[PairEstimate]) -> None:

@@ -102,7 +102,8 @@ IMU_FAULTS: dict[str, tuple[Callable[[ImuSeries], ImuSeries], str]] = {
         lambda imu: faults.accelerometer_bias_step(imu, AT_S, ACCELEROMETER_STEP / 3),
         "",
     ),
-    "an offset that jumps by 50 ms": (lambda imu: faults.clock_jump(imu, AT_S, 0.05), "used"),
+    "an offset that jumps by 20 ms": (lambda imu: faults.clock_jump(imu, AT_S, 0.02), "used"),
+    "an offset that jumps by 50 ms": (lambda imu: faults.clock_jump(imu, AT_S, 0.05), "clock jumps by +"),
     "an offset that jumps by 0.3 s": (lambda imu: faults.clock_jump(imu, AT_S, 0.3), "clock jumps by +"),
     "an offset that jumps by 2 s": (lambda imu: faults.clock_jump(imu, AT_S, 2.0), "clock jumps by +"),
     "time going backwards by 0.3 s": (lambda imu: faults.clock_jump(imu, AT_S, -0.3), "clock jumps by -"),
@@ -169,6 +170,37 @@ def test_a_clock_jump_is_found_with_its_size_and_what_is_about_it_is_left_out(by
     (change,) = calibration.changes
     assert abs(change.clock_ns / NANOSECONDS - by_s) < 0.05
     assert np.any((calibration.faulty_ns[:, 0] < change.at_ns) & (calibration.faulty_ns[:, 1] > change.at_ns))
+
+
+@pytest.mark.parametrize("seconds", [25.0, SECONDS])
+@pytest.mark.parametrize("by_s", [-0.2, -0.1, -0.05, 0.05, 0.1, 0.3])
+def test_a_small_clock_jump_is_found_in_a_short_drive_too(by_s: float, seconds: float) -> None:
+    """Its size to 15 ms, and when, to two seconds; fused ATE is within the bound of raw, or of a sound IMU's."""
+    log = faults.simulated(4, seconds)
+    sound = _fused(log)
+    result = _fused(replace(log, imu=faults.clock_jump(log.imu, seconds / 2, by_s)))
+    (jump,) = result.calibration.clock_jumps
+    assert abs(jump.by_s - by_s) < 0.015
+    assert abs((jump.at_ns - log.truth.stamps_ns[0]) / NANOSECONDS - seconds / 2) <= 2.0
+    for name in ("posegraph", "ekf"):
+        assert result.ate_m[name] <= MOST * max(result.ate_m["raw"], sound.ate_m[name]), (name, result.ate_m)
+
+
+@pytest.mark.parametrize("seconds", [25.0, SECONDS])
+def test_other_faults_are_no_clock_jumps(seconds: float) -> None:
+    """Not even a step of the gyro's bias, or pairs of which a fifth is wrong."""
+    log, half = faults.simulated(4, seconds), seconds / 2
+    for imu, pairs in (
+        (log.imu, log.pairs),
+        (faults.gap(log.imu, half, 2.0), log.pairs),
+        (faults.stuck_gyro(log.imu, half, 5.0), log.pairs),
+        (faults.saturated_gyro(log.imu, 0.3), log.pairs),
+        (faults.gyro_bias_step(log.imu, half, 0.03 * DIRECTION), log.pairs),
+        (faults.gyro_bias_step(log.imu, half, 0.3 * DIRECTION), log.pairs),
+        (log.imu, faults.dropped_frames(log.pairs, half, 10)),
+        (log.imu, faults.wrong_pairs(log.pairs, 0.2, 0)[0]),
+    ):
+        assert not calibrate(pairs, imu, None, None).clock_jumps
 
 
 def test_a_sound_imu_has_no_changes_and_no_faulty_stretches() -> None:

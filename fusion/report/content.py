@@ -134,7 +134,7 @@ class ReportContent:
             if event.kind != events.STAND_STILL  # the trajectory knows better
         ]
         yield from shown
-        jumps = events.clock_jumps(self.imu, self.pairs, topic)
+        jumps = events.clock_jumps(self.imu, self.pairs, topic, self.calibration)
         yield from jumps
         if self.calibration is not None:
             known = [event for event in (*shown, *jumps) if event.kind != events.IMU_GAP]
