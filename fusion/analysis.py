@@ -25,7 +25,14 @@ from fusion_io.errors import LogError
 from fusion_io.odometry import POSE_TYPES
 from fusion_io.progress import track
 from fusion_io.reader import Log
-from fusion_io.records import NANOSECONDS, ImuSeries, IntArray, PairEstimate, Trajectory
+from fusion_io.records import (
+    NANOSECONDS,
+    NIS_DEGREES_OF_FREEDOM,
+    ImuSeries,
+    IntArray,
+    PairEstimate,
+    Trajectory,
+)
 from fusion_io.recovery import scan
 from fusion_io.survey import ImuReadings, Survey
 
@@ -34,7 +41,6 @@ SCHEMA = 1
 SAMPLED_IMAGES = 40
 """So many images of a topic are looked at, evenly over the log."""
 
-NIS_DOF = 6
 NIS_PROBABILITY = 0.95
 
 _INERTIAL = {"imu", "gyro", "accelerometer"}
@@ -45,7 +51,7 @@ class Result:
     """A trajectory in an output log, and what its back end stated; None where the log does not tell.
 
     metrics: as ``evaluation.Metrics``. end_sigma_m, end_sigma_rad: roots of the summed variances of the last pose.
-    nis_mean: of the innovations, `NIS_DOF` is right; nis_inside: share within their two-sided bounds of
+    nis_mean: of the innovations, `NIS_DEGREES_OF_FREEDOM` is right; nis_inside: share within their two-sided bounds of
     `NIS_PROBABILITY`; used: share of the pairs that were not rejected.
     """
 
@@ -94,7 +100,7 @@ def analyse(path: Path, chosen: Mapping[str, str]) -> Analysis:
 
     Raises:
         LogError: the file cannot be read, or is not an MCAP file.
-        UsageError: ``chosen`` names a role that does not exist.
+        UsageError: ``chosen`` names a role that does not exist, or a topic that cannot play it.
 
     """
     contents = scan(path, lambda channel: True)
@@ -254,17 +260,17 @@ def _result(log: Log, name: str, truth: Trajectory | None) -> Result:
     trajectory = log.trajectory(name)
     if trajectory is None:
         return Result(0, 0.0, {}, None, None, None, None, None)
-    variances = None if trajectory.covariances is None else np.diag(trajectory.covariances[-1])
+    end_sigma_m, end_sigma_rad = trajectory.end_sigmas or (None, None)
     series = log.estimator(name)
     nis = np.zeros(0) if series is None else series.nis[np.isfinite(series.nis)]
-    low, high = chi2.interval(NIS_PROBABILITY, NIS_DOF)
+    low, high = chi2.interval(NIS_PROBABILITY, NIS_DEGREES_OF_FREEDOM)
     return Result(
         poses=len(trajectory),
         path_length_m=trajectory.path_length_m,
         metrics=asdict(evaluate(trajectory, truth)) if truth is not None else {},
-        end_sigma_m=None if variances is None else float(np.sqrt(variances[3:].sum())),
-        end_sigma_rad=None if variances is None else float(np.sqrt(variances[:3].sum())),
-        nis_mean=float(nis.mean()) if len(nis) else None,
+        end_sigma_m=end_sigma_m,
+        end_sigma_rad=end_sigma_rad,
+        nis_mean=None if series is None else series.nis_mean,
         nis_inside=float(np.mean((nis >= low) & (nis <= high))) if len(nis) else None,
         used=None if series is None else float(series.used.mean()),
     )

@@ -197,9 +197,9 @@ def _heading(name: str) -> str:
 
 def _legend(console: Console, compared: Comparison) -> None:
     if _has_truth(compared):
-        from fusion.table import ANEES_RULE
+        from fusion.table import RULE
 
-        lines = [f"Lower is better; {ANEES_RULE}."]
+        lines = [RULE]
         if compared.duels:
             lines.append("Differences are paired over segments: negative where the second has the smaller error.")
     else:

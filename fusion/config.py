@@ -111,7 +111,7 @@ class FusionConfig(Section):
     pair_rate_bias_sigma: PositiveFloat = 3e-3
     learned_pair_rate_bias_sigma: PositiveFloat = 1e-3
     pair_rate_bias_correlation_s: PositiveFloat = 10.0
-    pair_misalignment_sigma: PositiveFloat = 1.5e-2
+    pair_misalignment_sigma: PositiveFloat = 7.5e-3
     lever_arm_sigma: PositiveFloat = 1.0
     gate_probability: Probability = 1e-6
 

@@ -139,7 +139,8 @@ def _attempt(name: str, known: Measurements, config: RunConfig, findings: Findin
         findings.put(f"{name}_failed", 1, f"back end failed ({name}): {' '.join(str(error).split())}")
         return None
     rejected = estimate.rejected
-    findings.put(f"{name}_rejected", rejected, f"measurements rejected as outliers ({name}): {rejected}")
+    note = f"single measurements (pairs, IMU, loops, GNSS) rejected as outliers ({name}): {rejected}"
+    findings.put(f"{name}_rejected", rejected, note)
     return estimate
 
 

@@ -30,7 +30,16 @@ from fusion_io.errors import LogError, UsageError
 from fusion_io.findings import Findings
 from fusion_io.messages import CAMERA_FRAME
 from fusion_io.reader import Log
-from fusion_io.records import NANOSECONDS, CameraFrame, CameraInfo, GnssFix, ImuSeries, PairEstimate, Trajectory
+from fusion_io.records import (
+    NANOSECONDS,
+    NIS_DEGREES_OF_FREEDOM,
+    CameraFrame,
+    CameraInfo,
+    GnssFix,
+    ImuSeries,
+    PairEstimate,
+    Trajectory,
+)
 from fusion_io.trajectory_files import write_kitti, write_tum
 from fusion_io.writer import LogWriter
 
@@ -264,9 +273,14 @@ def _as_far_as_readable(frames: Iterator[CameraFrame], findings: Findings) -> It
 
 
 def _values(outcome: Outcome, name: str) -> dict[str, float | int | None]:
-    """The measures of a trajectory; without ground truth not even the number of segments is known."""
+    """The measures of a trajectory; without ground truth not even the number of segments is known, but its NIS is."""
     values = asdict(outcome.metrics[name])
-    return values if outcome.ground_truth is not None else dict.fromkeys(values)
+    estimate = outcome.estimates.get(name)
+    nis_mean = estimate.series.nis_mean if estimate is not None and estimate.series is not None else None
+    return (values if outcome.ground_truth is not None else dict.fromkeys(values)) | {
+        "nis_mean": nis_mean,
+        "nis_degrees_of_freedom": None if nis_mean is None else NIS_DEGREES_OF_FREEDOM,
+    }
 
 
 def _at_end(trajectory: Trajectory) -> dict[str, Any]:
@@ -279,10 +293,8 @@ def _at_end(trajectory: Trajectory) -> dict[str, Any]:
         "orientation_quat_wxyz": trajectory.poses.rotation[-1].as_quat(scalar_first=True).tolist(),
         "path_length_m": trajectory.path_length_m,
     }
-    if trajectory.covariances is not None:
-        variances = np.diag(trajectory.covariances[-1])
-        end["position_sigma_m"] = float(np.sqrt(variances[3:].sum()))
-        end["orientation_sigma_rad"] = float(np.sqrt(variances[:3].sum()))
+    if (sigmas := trajectory.end_sigmas) is not None:
+        end["position_sigma_m"], end["orientation_sigma_rad"] = sigmas
     return end
 
 

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, TextIO
 
 from fusion_io.command import STANDARD_OUTPUT, answered, command_parser, write_json, write_text
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from fusion.comparison import Comparison
     from fusion.config import RunConfig
+    from fusion.output import Outcome
     from fusion.results import Result
     from fusion_io.reader import Log
     from fusion_io.records import Trajectory
@@ -42,12 +44,14 @@ _SHOWN = (("t_rel_percent", "t_rel", "%", 3), ("r_rel_deg_per_100m", "r_rel", "d
 class Replay:
     """One combination of settings, the whole configuration, and what came of it.
 
-    trajectories: by name. notes: what became of the IMU, and what was amiss. failed: the back ends that have no result.
+    trajectories: by name. metrics: the content of metrics.json. notes: what became of the IMU, and what was amiss.
+    failed: the back ends that have no result.
     """
 
     settings: Settings
     config: RunConfig
     trajectories: Mapping[str, Trajectory]
+    metrics: dict[str, Any]
     notes: Sequence[str]
     failed: Sequence[str]
 
@@ -67,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay all combinations of settings, compare them with what was recorded, and show it; returns the exit code."""
     from fusion import compare, comparison
     from fusion.results import Result, log_file
-    from fusion.table import HEADINGS
+    from fusion.table import HEADINGS, end_lines
     from fusion_io.progress import track
     from fusion_io.reader import open_log
 
@@ -104,8 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
         _print(sweep_table(replays, compared, order, measure), stream)
     print(f"{replays[order[0]].label}, compared with the recorded run:", file=stream)
     compare.show(best, stream)
-    for note in replays[order[0]].notes:
-        print(note, file=stream)
+    for line in (*end_lines(replays[order[0]].trajectories), *replays[order[0]].notes):
+        print(line, file=stream)
     if all(each.failed for each in replays):
         return EXIT_FAILED
     return EXIT_DAMAGED if log.damaged else EXIT_OK
@@ -181,36 +185,55 @@ def not_run(base: RunConfig, configurations: Sequence[RunConfig]) -> list[str]:
 def replay(log: Log, settings: Settings, config: RunConfig) -> Replay:
     """Fuse what the log recorded with a configuration; the settings are what it is called by."""
     from fusion.fusing import back_ends
-
-    trajectories, notes = fuse_again(log, config)
-    failed = [name for name in back_ends(config) if name not in trajectories]
-    return Replay(settings, config, trajectories, notes, failed)
-
-
-def fuse_again(log: Log, config: RunConfig) -> tuple[dict[str, Trajectory], list[str]]:
-    """The trajectories, by name, of the recorded pairs and IMU; and in lines what became of them and was amiss.
-
-    Raises LogError for a log without recorded pairs.
-    """
-    from fusion import chain, fusing, gnss, imu
+    from fusion.output import metrics_document
     from fusion.placement import imu_line
-    from fusion.run import known_mounting
     from fusion.table import HEADINGS
+
+    started = perf_counter()
+    outcome = fuse_again(log, config)
+    metrics = metrics_document(outcome, {"replay": perf_counter() - started})
+    estimates = outcome.estimates
+    of_back_ends = [f"{HEADINGS[name]}: {each.note}" for name, each in estimates.items()]
+    notes = [imu_line(outcome.calibration, estimates.values()), *of_back_ends, *outcome.findings.notes]
+    failed = [name for name in back_ends(config) if name not in outcome.trajectories]
+    return Replay(settings, config, outcome.trajectories, metrics, notes, failed)
+
+
+def fuse_again(log: Log, config: RunConfig) -> Outcome:
+    """What a run makes of the recorded pairs, IMU, loops and positions; a log without pairs raises LogError."""
+    from fusion import chain, fusing, gnss, imu
+    from fusion.evaluation import evaluate
+    from fusion.output import Outcome
+    from fusion.run import known_mounting
     from fusion_io.findings import Findings
 
-    pairs, samples = log.pairs(), log.imu()
+    pairs, samples, fixes, truth = log.pairs(), log.imu(), log.gnss(), log.ground_truth()
     if not pairs:
         raise LogError(f"{log.path}: no recorded pair estimates to replay: run fusion.run on it first")
     findings = Findings()
     calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
     known = fusing.measurements(pairs, samples, calibration, log.frame_stamps(), findings)
     skips = fusing.between_steps(log.skips(), known.steps)
-    positions = gnss.positions(log.gnss(), config.gnss, findings)
+    positions = gnss.positions(fixes, config.gnss, findings)
     known = replace(known, skips=skips, loops=log.loops(), gnss=positions)
     estimates = fusing.fuse(known, config, findings)
     trajectories = {"raw": chain.chain(known.steps)} | {name: each.trajectory for name, each in estimates.items()}
-    of_back_ends = [f"{HEADINGS[name]}: {each.note}" for name, each in estimates.items()]
-    return trajectories, [imu_line(calibration, estimates.values()), *of_back_ends, *findings.notes]
+    metrics = {name: evaluate(each, truth, config.segment_lengths_m) for name, each in trajectories.items()}
+    return Outcome(
+        log,
+        config,
+        samples,
+        pairs,
+        truth,
+        calibration,
+        trajectories,
+        estimates,
+        metrics,
+        findings,
+        known.loops,
+        fixes,
+        known.skips,
+    )
 
 
 def recorded_result(log: Log) -> Result | None:
@@ -342,7 +365,7 @@ def document(
 
 
 def write_folder(folder: Path, best: Replay, compared: Comparison) -> None:
-    """Write the trajectories of a replay as NAME.tum and NAME.kitti.txt, its configuration, and the comparison."""
+    """Write a replay's trajectories as NAME.tum and NAME.kitti.txt, its configuration, the comparison, metrics.json."""
     from fusion.comparison_page import page
     from fusion.config import to_toml
     from fusion_io.trajectory_files import write_kitti, write_tum
@@ -352,6 +375,7 @@ def write_folder(folder: Path, best: Replay, compared: Comparison) -> None:
     for name, trajectory in best.trajectories.items():
         write_tum(folder / f"{name}.tum", trajectory)
         write_kitti(folder / f"{name}.kitti.txt", trajectory)
+    write_json(folder / "metrics.json", best.metrics)  # the last, as of a run
 
 
 def _metrics(compared: Comparison, prefix: str) -> dict[str, Any]:
@@ -417,7 +441,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures; - is stdout")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write the trajectories, configuration and page of the best"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write the trajectories, configuration, page and metrics.json of the best",
     )
     return parser
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import perf_counter, strftime
@@ -274,7 +274,7 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
 
     from fusion.placement import imu_line
     from fusion.report.verdict import doubts, judgement
-    from fusion.table import HEADINGS, print_table
+    from fusion.table import HEADINGS, end_lines, print_table
 
     log = outcome.log
     title = f"{log.path.name}: {counted(len(outcome.trajectories['raw']), 'frame')}, {outcome.duration_s:.1f} s"
@@ -282,23 +282,14 @@ def print_results(folder: Path, outcome: Outcome, stream: TextIO) -> None:
     print_table(Console(file=stream), title, outcome.trajectories, metrics)
     for line in (*doubts(outcome.content), judgement(outcome.content)[0]):
         print(f"{line[0].upper()}{line[1:]}.", file=stream)
-    print(f"At the end, right, down and ahead of the start: {'; '.join(ends(outcome.trajectories))}", file=stream)
+    for line in end_lines(outcome.trajectories):
+        print(line, file=stream)
     for remark in (*log.remarks, *outcome.findings.remarks):
         print(remark, file=stream)
     print(imu_line(outcome.calibration, outcome.estimates.values()), file=stream)
     for name, estimate in outcome.estimates.items():
         print(f"{HEADINGS[name]}: {estimate.note}", file=stream)
     print(f"Results: {folder}", file=stream)
-
-
-def ends(trajectories: Mapping[str, Trajectory]) -> list[str]:
-    """Where the camera was at the end by each trajectory; how sure that is stands in the table."""
-    from fusion.table import HEADINGS
-
-    return [
-        f"{HEADINGS[name]} {', '.join(f'{value:.1f}' for value in each.poses.translation[-1])} m"
-        for name, each in trajectories.items()
-    ]
 
 
 def exit_code(outcome: Outcome) -> int:

@@ -49,12 +49,12 @@ class Difference(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """What it says of b where less is better: "better", "worse", "no difference" or "path too short to tell"."""
+        """What it says of b where less is better: "better", "worse", "not significant" or "path too short to tell"."""
         match self.significant:
             case None:
                 return "path too short to tell"
             case False:
-                return "no difference"
+                return "not significant"
         return "better" if self.mean < 0.0 else "worse"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from scipy.spatial.transform import Rotation
 
 from fusion.evaluation import anees_bounds
 from fusion_io.records import Trajectory
@@ -27,7 +28,9 @@ HEADINGS = {
 WIDTH_OF_NUMBER = 9
 EQUAL = 1e-9  # relative: what differs less is the same result in other digits
 
-ANEES_RULE = "an ANEES above {1:.1f} is overconfident, below {0:.1f} timid".format(*anees_bounds())
+RULE = "Lower is better; ANEES: 3 is right, above {1:.1f} is overconfident, below {0:.1f} timid.".format(
+    *anees_bounds()
+)
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,8 @@ def print_table(
         if any(value is not None for value in values):
             table.add_row(row.label, Text(row.unit), *_cells(row, values))
     table.add_section()
-    table.add_row("path length", "m", *(number(each.path_length_m, 1) for each in trajectories.values()))
-    table.add_row("stated sigma at the end", "m", *(final_sigma(each) for each in trajectories.values()))
+    for label, unit, cell in END_ROWS:
+        table.add_row(label, unit, *map(cell, trajectories.values()))
     console.print(Text(title))
     console.print(table)
     console.print(Text(_legend(metrics)))
@@ -105,12 +108,46 @@ def _legend(metrics: Mapping[str, Metrics]) -> str:
     if all(values["ate_m"] is None for values in metrics.values()):
         return "No ground truth for these frames in the log, so no errors can be given."
     if all(values["t_rel_percent"] is None for values in metrics.values()):
-        return "Lower is better. No t_rel: the path is shorter than the shortest of --segment-lengths."
-    return f"Lower is better; {ANEES_RULE}."
+        return f"{RULE} No t_rel: the path is shorter than the shortest of --segment-lengths."
+    return RULE
 
 
-def final_sigma(trajectory: Trajectory) -> str:
-    """Root of the summed variances of the last position, as the back end states it."""
-    if trajectory.covariances is None:
-        return "-"
-    return number(float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:]))), 2)
+def _position_sigma(trajectory: Trajectory) -> str:
+    return "-" if trajectory.end_sigmas is None else number(trajectory.end_sigmas[0], 2)
+
+
+def _orientation_sigma(trajectory: Trajectory) -> str:
+    return "-" if trajectory.end_sigmas is None else number(float(np.rad2deg(trajectory.end_sigmas[1])), 3)
+
+
+END_ROWS: Sequence[tuple[str, str, Callable[[Trajectory], str]]] = (
+    ("path length", "m", lambda trajectory: number(trajectory.path_length_m, 1)),
+    ("stated sigma at the end", "m", _position_sigma),
+    ("stated sigma at the end", "deg", _orientation_sigma),
+)
+"""What needs no ground truth: name, unit, and how it is shown."""
+
+
+def end_lines(trajectories: Mapping[str, Trajectory]) -> list[str]:
+    """Where the camera was at the end by each trajectory, and how turned; how sure that is stands in the table."""
+    places = {name: each.poses.translation[-1].tolist() for name, each in trajectories.items()}
+    turns = {name: turned_deg(each.poses.rotation[-1]) for name, each in trajectories.items()}
+    return [
+        f"At the end, right, down and ahead of the start: {_side_by_side(places, 'm')}",
+        f"Turned right, up and clockwise by then: {_side_by_side(turns, 'deg')}",
+    ]
+
+
+def _side_by_side(values: Mapping[str, Sequence[float]], unit: str) -> str:
+    return "; ".join(
+        f"{HEADINGS[name]} {', '.join(f'{value:z.1f}' for value in three)} {unit}" for name, three in values.items()
+    )
+
+
+def turned_deg(rotation: Rotation) -> tuple[float, float, float]:
+    """How far a camera that began level is turned to the right, then up, then clockwise about its view, in degrees."""
+    matrix = rotation.as_matrix()
+    ahead, level = matrix[:, 2], matrix[1, :2]
+    angles = np.arctan2([ahead[0], -ahead[1], level[0]], [ahead[2], np.hypot(*level), level[1]])
+    right, up, clockwise = np.rad2deg(angles).tolist()
+    return right, up, clockwise

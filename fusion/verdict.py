@@ -259,7 +259,7 @@ def _events(found: Found) -> Iterable[Reason]:
         text = f"{kind}, {group[0].text}"
         if len(group) > 1:
             longest = max(event.duration_s for event in group)
-            text += f" (the first of {len(group)}; {total:.1f} s in all, the longest {longest:.2f} s)"
+            text += f" (the first of {len(group)} times; {total:.1f} s in all, the longest {longest:.2f} s)"
         times = found.topics[topic]
         short = kind in MISSING and total * NANOSECONDS <= SHORT_SHARE * (times.end_ns - times.start_ns)
         level = Level.NOTE if short or kind == STAND_STILL else Level.LIMIT

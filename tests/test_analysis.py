@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from log_samples import (
     write_sample,
 )
 from mcap.writer import Writer
+from report_samples import pairs_of, simulate
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import log_statistics
@@ -105,6 +107,18 @@ def test_messages_that_we_do_not_know_are_timed_by_their_header_if_they_have_one
     topics = found(tmp_path / "a.mcap")["topics"]
     assert (topics["/with"]["clock"], topics["/with"]["clock_offset_s"]) == ("stamp", 5.0)
     assert (topics["/without"]["clock"], topics["/without"]["clock_offset_s"]) == ("recorder", None)
+
+
+def test_wrong_pairs_are_counted_by_how_often_and_each_time_says_of_how_many_pairs_it_is(tmp_path: Path) -> None:
+    pairs = pairs_of(simulate(20.0)[0])
+    for i in (50, 51, 100):
+        pairs[i] = replace(pairs[i], translation=pairs[i].translation + [0.0, 0.0, 5.0])
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.pairs(pairs)
+    (text,) = [each["text"] for each in found(tmp_path / "a.mcap")["verdict"]["reasons"] if "wrong" in each["text"]]
+    assert text == (
+        "wrong pairs, 2 pairs: unlike its neighbours (the first of 2 times; 0.3 s in all, the longest 0.20 s)"
+    )
 
 
 # --- Light and depth ----------------------------------------------------------------------------

@@ -61,7 +61,9 @@ def test_python_gives_the_numbers_of_the_command(
     trajectory = fusion.fuse(log.pairs(), log.imu(), backend=backend)  # type: ignore[arg-type]  # a parameter here
     metrics = fusion.evaluate(trajectory, log.ground_truth())
     expected = evaluated(backend)
-    assert {name: getattr(metrics, name) for name in fusion.Metrics.__slots__} == expected
+    assert {name: getattr(metrics, name) for name in fusion.Metrics.__slots__} == {
+        name: value for name, value in expected.items() if not name.startswith("nis")
+    }
 
 
 def test_pairs_alone_are_fused_without_an_imu(log_path: Path) -> None:

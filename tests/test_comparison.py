@@ -39,13 +39,13 @@ def test_a_trajectory_differs_from_itself_by_nothing() -> None:
     duel = _duel(walk(1), walk(1))
     for difference in duel.differences.values():
         assert_allclose([difference.mean, difference.low, difference.high], 0.0, atol=1e-9)
-        assert difference.verdict == "no difference"
+        assert difference.verdict == "not significant"
 
 
 def test_trajectories_with_the_same_noise_are_seldom_told_apart() -> None:
     """Intervals of 95 %: two of forty are expected, more than six would be seen in less than one of a hundred."""
     verdicts = [_duel(walk(seed), walk(seed + 100)).differences["t_rel_percent"].verdict for seed in range(1, 41)]
-    assert verdicts.count("no difference") > 0
+    assert verdicts.count("not significant") > 0
     assert verdicts.count("better") + verdicts.count("worse") <= 6
 
 

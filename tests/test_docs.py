@@ -1,5 +1,6 @@
 """What the documentation says is so: links lead somewhere, code runs, options, settings and keys exist."""
 
+import ast
 import importlib.util
 import itertools
 import json
@@ -201,6 +202,60 @@ def test_every_key_of_metrics_json_is_documented(workplace: Path) -> None:
         general = re.sub(r"^(trajectories|at_end)\.\w+", r"\1.NAME", key)
         open_ended = general.rpartition(".")[0] + ".*"
         assert general in documented or open_ended in documented, f"{key} is not documented"
+
+
+COUNTING = re.compile(r"\w*findings\.(put|add)|self\._findings\.(put|add)|self\._(report|note)|Damage|skipped\.update")
+"""What is called with the name of a warning as its first argument."""
+
+PASSED_ON = {"reader.py: name", "reader.py: damage.name", "recovery.py: name", "run.py: name"}
+"""Names that are counted where they come from somewhere else, where they are found as well."""
+
+
+def words(node: ast.AST, constants: dict[str, str]) -> Iterator[str]:
+    """The strings that an expression can be, `*` for a part that only the run knows."""
+    if isinstance(node, ast.JoinedStr):
+        yield "".join(str(part.value) if isinstance(part, ast.Constant) else "*" for part in node.values)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+    elif isinstance(node, ast.Name) and node.id in constants:
+        yield constants[node.id]
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from words(child, constants)
+
+
+def counted_warnings() -> tuple[set[str], set[str]]:
+    """The names that the code counts warnings under, and the expressions of those that it does not spell out."""
+    found: set[str] = set()
+    unknown: set[str] = set()
+    for path in sorted(each for folder in ("fusion", "learned", "io") for each in (ROOT / folder).rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        constants = {
+            ast.unparse(each.targets[0]): each.value.value
+            for each in tree.body
+            if isinstance(each, ast.Assign)
+            and isinstance(each.value, ast.Constant)
+            and isinstance(each.value.value, str)
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "skipped":
+                found.update(words(node.slice, constants))
+            if not isinstance(node, ast.Call) or not node.args:
+                continue
+            if COUNTING.fullmatch(ast.unparse(node.func)):
+                said = set(words(node.args[0], constants))
+                found |= said
+                if not said:
+                    unknown.add(f"{path.name}: {ast.unparse(node.args[0])}")
+    return found, unknown
+
+
+def test_every_warning_that_can_be_counted_is_documented_and_no_other() -> None:
+    counted, unknown = counted_warnings()
+    assert unknown == PASSED_ON, "a name that this test cannot find"
+    _, _, section = (DOCS / "reference" / "metrics-json.md").read_text().partition("## Warnings")
+    documented = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
+    assert sorted(re.sub("ROLE|NAME", "*", name) for name in documented) == sorted(counted)
 
 
 def test_every_column_of_the_tables_is_documented(workplace: Path) -> None:

@@ -160,6 +160,9 @@ def test_outliers_are_counted_by_back_end() -> None:
     findings = Findings()
     fusing.fuse(replace(KNOWN, steps=pairs), CONFIG, findings)
     assert findings.counts == {"posegraph_rejected": 1, "ekf_rejected": 1}
+    assert [
+        note for note in findings.notes if not note.startswith("single measurements (pairs, IMU, loops, GNSS)")
+    ] == []
 
 
 def test_an_imu_that_is_used_comes_on_the_cameras_clock_without_its_faulty_stretches() -> None:

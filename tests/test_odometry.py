@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion_io import messages
-from fusion_io.errors import LogError
+from fusion_io.errors import LogError, UsageError
 from fusion_io.messages import PoseSample
 from fusion_io.odometry import name_of, only_trajectory, read_trajectories, trajectory_on
 from fusion_io.reader import open_log
@@ -118,8 +118,11 @@ def test_the_trajectory_on_a_topic_is_taken_or_what_there_is_is_named(tmp_path: 
     path = write_raw(tmp_path / "two.mcap", two)
     recorded = read_trajectories(path)
     assert len(trajectory_on(path, recorded, "/slam/pose")) == 3
-    for topic, reason in ((None, "which of its trajectories?"), ("/x", "no trajectory on /x.")):
-        with pytest.raises(LogError) as caught:
+    for topic, reason, error in (
+        (None, "which of its trajectories?", LogError),
+        ("/x", "no trajectory on /x.", UsageError),  # the user named it
+    ):
+        with pytest.raises(error) as caught:
             trajectory_on(path, recorded, topic)
         assert str(caught.value) == f"{path}: {reason} It holds odom, slam_pose; choose one with --topic"
     path = write_raw(tmp_path / "one.mcap", two[::2])

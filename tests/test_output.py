@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from report_samples import series_of
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import config, output
@@ -141,8 +142,10 @@ def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.O
             "rpe_rotation_rad",
             "anees_position",
             "anees_orientation",
+            "nis_mean",
+            "nis_degrees_of_freedom",
         }
-        assert all(np.isfinite(value) for value in values.values())
+        assert all(np.isfinite(value) for name, value in values.items() if not name.startswith("nis"))
     assert document["calibration"] == {
         "rotation_imu_camera_quat_wxyz": pytest.approx([0.5, -0.5, 0.5, -0.5]),
         "rotation_std_deg": None,
@@ -183,10 +186,33 @@ def test_what_could_not_be_computed_is_null(outcome: output.Outcome) -> None:
     )
     document = json.loads(json.dumps(output.metrics_document(bare, SECONDS), allow_nan=False))
     for values in document["trajectories"].values():
-        assert set(values) == {field.name for field in fields(Metrics)}
+        assert set(values) == {"nis_mean", "nis_degrees_of_freedom"} | {field.name for field in fields(Metrics)}
         assert all(value is None for value in values.values())
     assert document["calibration"]["rotation_imu_camera_quat_wxyz"] is None
     assert document["calibration"]["time_offset_s"] is None
+
+
+def test_the_mean_nis_is_that_of_all_pairs_that_have_one_and_needs_no_ground_truth(outcome: output.Outcome) -> None:
+    """Rejected ones count, frames without an innovation do not; a back end without any, and raw, have null."""
+    series = series_of(np.arange(50))
+    none = replace(series, nis=np.full(50, np.nan))
+    nis = none.nis.copy()
+    rejected = np.flatnonzero(~series.used)[0]
+    nis[[10, rejected, 30]] = 3.0, 30.0, 6.0
+    some = replace(series, nis=nis)
+    document = output.metrics_document(
+        replace(
+            outcome,
+            ground_truth=None,
+            estimates={
+                "ekf": Estimate(_trajectory(1), "", series=some),
+                "posegraph": Estimate(_trajectory(1), "", series=none),
+            },
+        ),
+        SECONDS,
+    )["trajectories"]
+    found = {name: (each["nis_mean"], each["nis_degrees_of_freedom"]) for name, each in document.items()}
+    assert found == {"raw": (None, None), "posegraph": (None, None), "ekf": (13.0, 6)}
 
 
 def test_a_back_end_that_was_not_asked_for_is_absent_also_from_an_earlier_run(

@@ -38,6 +38,14 @@ def test_the_top_view_draws_x_against_z_of_every_trajectory_at_one_scale(traject
     for name, trajectory in trajectories.items():
         assert_allclose(lines[STYLES[name]["label"]], trajectory.poses.translation[:, [0, 2]].T)
     assert_allclose(lines["ground truth"], _arc().poses.translation[:, [0, 2]].T, atol=1e-9)
+    (start,), ends = (
+        [line.get_xydata() for line in axes.get_lines() if line.get_marker() == marker and len(line.get_xdata())]
+        for marker in "os"
+    )
+    assert_allclose(start, [[0.0, 0.0]])
+    for trajectory in trajectories.values():
+        assert any(np.allclose(end, trajectory.poses.translation[-1, [0, 2]]) for end in ends)
+    assert {"start", "end"} <= lines.keys()
     assert axes.get_aspect() == 1.0
     assert axes.get_title() == "log"
     assert "[m]" in axes.get_xlabel()

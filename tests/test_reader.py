@@ -608,11 +608,11 @@ def test_a_whole_imu_is_preferred_to_its_halves(tmp_path: Path) -> None:
     assert open_log(path).roles == {"imu": "/c/unit"}
 
 
-def test_a_choice_that_cannot_be_is_an_error(tmp_path: Path) -> None:
+def test_a_choice_that_cannot_be_is_an_error_of_usage(tmp_path: Path) -> None:
     path = write_raw(tmp_path / "a.mcap", [whole_imu("/imu"), camera_info("/c/camera_info", START)])
-    with pytest.raises(LogError, match=r"topic /nowhere cannot be the imu; /imu could be"):
+    with pytest.raises(UsageError, match=r"topic /nowhere cannot be the imu; /imu could be"):
         open_log(path, {"imu": "/nowhere"})
-    with pytest.raises(LogError, match=r"topic /imu cannot be the depth; no topic could be"):
+    with pytest.raises(UsageError, match=r"topic /imu cannot be the depth; no topic could be"):
         open_log(path, {"depth": "/imu"})
     with pytest.raises(UsageError, match="there is no role 'lidar'"):
         open_log(path, {"lidar": "/imu"})

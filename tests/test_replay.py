@@ -195,7 +195,7 @@ def test_only_what_is_better_than_others_is_marked_best(
         Comparison([result], (), {"b.raw": Metrics(), "b.ekf": Metrics(t_rel_percent=value, ate_m=value)}, [], [], [])
         for value in t_rel
     ]
-    replays = [replay.Replay(each, RunConfig(), result.trajectories, [], []) for each in combinations]
+    replays = [replay.Replay(each, RunConfig(), result.trajectories, {}, [], []) for each in combinations]
     order, measure = replay.ranked(compared, None, combinations)
     table = replay.sweep_table(replays, compared, order, measure)
     assert list(table.columns[0].cells) == marks

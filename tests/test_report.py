@@ -15,6 +15,7 @@ import pytest
 from log_samples import pair_estimates, write_sample
 from numpy.testing import assert_allclose, assert_array_equal
 from report_samples import LENGTHS_M, content
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion import events
 from fusion.evaluation import anees_bounds, errors_over_time, evaluate
@@ -212,6 +213,12 @@ def test_gnss_positions_are_drawn_believed_ones_apart(full: ReportContent) -> No
     assert json.loads(_unpacked(page(full), "data"))["fixes"] == []
 
 
+def test_the_mean_nis_is_beside_its_line(full: ReportContent) -> None:
+    for name, series in full.series.items():
+        lines = [line.name for row in _by_key(full)["nis"].rows for line in row.lines if line.style == name]
+        assert [f"mean {np.nanmean(series.nis):.3g}" in line for line in lines] == [True]
+
+
 def test_what_is_nearly_zero_does_not_stretch_a_logarithmic_axis(full: ReportContent) -> None:
     """The last pair of a chain has nothing to contradict it: its NIS is 1e-25."""
     nis = full.series["posegraph"].nis.copy()
@@ -265,8 +272,7 @@ def test_verdict_table_and_figure_judge_an_anees_by_one_rule(full: ReportContent
             said = verdict(replace(full, metrics={**full.metrics, "posegraph": metrics}, series={}, warnings={}))
             assert f"its {what} errors are 1.3 times its sigmas: {word} (ANEES {value:.3g}, 3 is right)" in said.text
             assert (said.status == "caution") == (word == "overconfident")
-    rule = f"an ANEES above {high:.1f} is overconfident"
-    assert rule in _read(page(full)).text
+    assert f"ANEES: 3 is right, above {high:.1f} is overconfident" in _read(page(full)).text
     assert f"above {high:.1f} is overconfident" in _by_key(full)["nees"].caption
 
 
@@ -276,6 +282,34 @@ def test_the_verdict_says_where_the_camera_was_at_the_end(full: ReportContent) -
     assert f"{abs(right):.1f} m {'right' if right > 0 else 'left'}" in said
     assert f"{abs(down):.1f} m {'below' if down > 0 else 'above'}" in said
     assert f"{abs(ahead):.1f} m {'ahead' if ahead > 0 else 'behind'} of where it began (stated sigma" in said
+
+
+def test_the_verdict_says_how_the_camera_was_turned_at_the_end(full: ReportContent) -> None:
+    """By the angles that the printout has, each with its side, and the sigma of `at_end` in degrees."""
+    trajectory = full.trajectories["posegraph"]
+    covariances = np.zeros((len(trajectory), 6, 6))
+    covariances[-1, :3, :3] = np.deg2rad(1.5) ** 2 / 3 * np.eye(3)
+    for sign, sides in ((1.0, ("right", "up", "clockwise")), (-1.0, ("left", "down", "counterclockwise"))):
+        last = Rotation.from_euler("YXZ", sign * np.array([30.0, 20.0, 10.0]), degrees=True)
+        rotations = Rotation.concatenate([trajectory.poses.rotation[:-1], last])
+        poses = RigidTransform.from_components(trajectory.poses.translation, rotations)
+        turned = Trajectory(trajectory.stamps_ns, poses, covariances)
+        said = verdict(replace(full, trajectories={**full.trajectories, "posegraph": turned})).text
+        angles = ", ".join(f"{angle}.0 deg {side}" for angle, side in zip((30, 20, 10), sides, strict=True))
+        assert f"turned {angles} (stated sigma 1.5 deg)" in said
+
+
+def test_the_verdict_counts_how_often_a_fault_was_there(full: ReportContent) -> None:
+    """Wrong pairs side by side are one time, those apart are two; of how many pairs each is, its event says."""
+
+    def wrong(*which: int) -> str:
+        pairs = list(full.pairs)
+        for i in which:
+            pairs[i] = replace(pairs[i], translation=pairs[i].translation + [0.0, 0.0, 5.0])
+        return verdict(replace(full, pairs=pairs, series={})).text
+
+    assert re.search(r"found wrong pairs[;.]", wrong(100, 101))
+    assert "found wrong pairs (2 times)" in wrong(100, 101, 200)
 
 
 def test_a_hole_in_everything_leads_the_verdict_with_the_time_from_which_the_pose_is_lost() -> None:

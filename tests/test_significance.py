@@ -49,7 +49,7 @@ def test_a_series_with_itself_differs_by_nothing() -> None:
     errors = _segments(np.random.default_rng(2).uniform(0.0, 3.0, 100), 10)
     difference = paired_difference(errors, errors, "rotation_deg_per_100m")
     assert difference == Difference(0.0, 0.0, 0.0)
-    assert difference.verdict == "no difference"
+    assert difference.verdict == "not significant"
 
 
 def test_swapping_the_two_flips_the_signs() -> None:

@@ -5,9 +5,9 @@ from io import StringIO
 import numpy as np
 import pytest
 from rich.console import Console
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
-from fusion.table import ROWS, best_of, print_table
+from fusion.table import ROWS, best_of, end_lines, print_table, turned_deg
 from fusion_io.records import Trajectory
 
 NAMES = ("raw", "posegraph", "ekf")
@@ -52,11 +52,41 @@ def test_path_and_stated_uncertainty_need_no_ground_truth(name: str) -> None:
     assert "No ground truth" in text
     assert "t_rel" not in text
     assert next(line for line in text.splitlines() if "path length" in line).split()[-1] == "7.0"
-    assert next(line for line in text.splitlines() if "stated sigma" in line).split()[-1] == "1.73"
+    sigmas = [line.split()[-2:] for line in text.splitlines() if "stated sigma" in line]
+    assert sigmas == [["m", "1.73"], ["deg", f"{np.rad2deg(np.sqrt(3.0)):.3f}"]]
 
 
 def test_a_log_shorter_than_a_segment_says_so() -> None:
     assert "--segment-lengths" in _printed({"raw": _metrics(1.0) | {"t_rel_percent": None}})
+
+
+@pytest.mark.parametrize("missing", [{}, {"t_rel_percent": None}])
+def test_what_stands_under_the_table_is_right_for_all_its_rows(missing: dict[str, None]) -> None:
+    """Lower is better of all but the rows whose unit says what is right."""
+    text = " ".join(_printed({"raw": _metrics(1.0) | missing}).split())
+    other = {(row.label.partition(",")[0], row.right) for row in ROWS if row.right}
+    assert other == {("ANEES", 3.0)}
+    assert "Lower is better; ANEES: 3 is right, above 4.7 is overconfident, below 1.7 timid." in text
+
+
+@pytest.mark.parametrize(
+    ("right_deg", "up_deg", "clockwise_deg"),
+    [(170.0, 0.0, 0.0), (0.0, 20.0, 0.0), (0.0, 0.0, 10.0), (-30.0, -20.0, -9.0)],
+)
+def test_the_end_is_told_as_places_and_turns(right_deg: float, up_deg: float, clockwise_deg: float) -> None:
+    """About the camera's y axis, which is down, its x axis, and its z axis, which is ahead, in this order."""
+    rotation = Rotation.from_euler("YXZ", [right_deg, up_deg, clockwise_deg], degrees=True)
+    poses = RigidTransform.from_components([[0.0, 0.0, 0.0], [1.0, -0.04, 3.0]], Rotation.concatenate([rotation] * 2))
+    assert end_lines({"raw": Trajectory(np.arange(2), poses)}) == [
+        "At the end, right, down and ahead of the start: raw 1.0, 0.0, 3.0 m",
+        f"Turned right, up and clockwise by then: raw {right_deg}, {up_deg}, {clockwise_deg} deg",
+    ]
+
+
+def test_a_camera_that_looks_straight_up_at_the_end_is_turned_up() -> None:
+    """There right and clockwise cannot be told apart."""
+    rotation = Rotation.from_euler("YXZ", [30.0, 90.0, 15.0], degrees=True)
+    assert turned_deg(rotation)[1] == pytest.approx(90.0)
 
 
 @pytest.mark.parametrize(

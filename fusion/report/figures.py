@@ -25,7 +25,15 @@ from fusion.evaluation import (
 )
 from fusion.report.content import ReportContent
 from fusion.report.verdict import agreements, label, nis_bounds
-from fusion_io.records import NANOSECONDS, EstimatorSeries, FloatArray, IntArray, PairEstimate, Trajectory
+from fusion_io.records import (
+    NANOSECONDS,
+    NIS_DEGREES_OF_FREEDOM,
+    EstimatorSeries,
+    FloatArray,
+    IntArray,
+    PairEstimate,
+    Trajectory,
+)
 
 TIME = "time since the first frame [s]"
 CAMERA_AXES = ("x, right", "y, down", "z, ahead")
@@ -316,8 +324,9 @@ def nis(content: ReportContent) -> Figure:
         "nis",
         "NIS: do the measurements fit the model?",
         f"Squared innovation of each pair by its covariance, 6 degrees of freedom; 95 % between {low:.2f} and "
-        f"{high:.2f} where all is modelled right. Needs no ground truth. All near zero: nothing but the pairs spoke of "
-        "the motion.",
+        f"{high:.2f} where all is modelled right, with a mean of {NIS_DEGREES_OF_FREEDOM}. Needs no ground truth. The "
+        "pose graph's are residuals, after it has used the pair, and smaller. All near zero: nothing but the pairs "
+        "spoke of the motion.",
         missing=_without_series(content, "innovations"),
     )
     rows: list[Row] = []
@@ -325,7 +334,8 @@ def nis(content: ReportContent) -> Figure:
         seconds = content.seconds(each.stamps_ns)
         inside = np.mean((each.nis >= low) & (each.nis <= high), where=np.isfinite(each.nis))
         squares = _above_zero(each.nis)
-        lines = [Line(f"{label(name)}, {100.0 * inside:.0f} % inside", seconds, squares, name)]
+        said = f"{label(name)}, mean {each.nis_mean:.3g}, {100.0 * inside:.0f} % inside"
+        lines = [Line(said, seconds, squares, name)]
         if np.any(out := ~each.used & np.isfinite(each.nis)):
             lines.append(Line("rejected", seconds[out], squares[out], "fault", mode="markers", legend=not rows))
         rows.append(Row(label(name), [*lines, *_bounds(_ends(seconds), low, high, legend=not rows)], log=True))

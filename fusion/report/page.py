@@ -27,7 +27,7 @@ from fusion.placement import Placement, placement
 from fusion.report.content import ReportContent
 from fusion.report.figures import Figure, figures, sensor_stamps
 from fusion.report.verdict import Verdict, label, verdict
-from fusion.table import ANEES_RULE, ROWS, final_sigma, number
+from fusion.table import END_ROWS, ROWS, RULE, number
 from fusion_io.records import NANOSECONDS, FloatArray, IntArray, Trajectory
 from fusion_io.words import counted
 
@@ -242,14 +242,11 @@ def _metrics(content: ReportContent) -> str:
         body.append(
             f"<tr><th scope=row>{escape(row.label)} <small>{escape(row.unit)}</small></th>{''.join(cells)}</tr>"
         )
-    for what, unit, cell in (
-        ("path length", "m", lambda each: number(each.path_length_m, 1)),
-        ("stated sigma at the end", "m", final_sigma),
-    ):
+    for what, unit, cell in END_ROWS:
         cells = [f"<td>{escape(cell(content.trajectories[name]))}</td>" for name in names]
         body.append(f"<tr><th scope=row>{what} <small>{unit}</small></th>{''.join(cells)}</tr>")
     head = "".join(f'<th scope=col><i class="key {name}"></i>{escape(label(name))}</th>' for name in names)
-    rule = f"<p class=caption>Lower is better; {ANEES_RULE}.</p>" if any(content.metrics.values()) else ""
+    rule = f"<p class=caption>{RULE}</p>" if any(content.metrics.values()) else ""
     return f"<table class=numbers><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{rule}"
 
 

@@ -192,6 +192,16 @@
     });
   }
 
+  // Where all begin, a ring, and where each ends, a square of its colour: as in trajectories.png.
+  function endTraces() {
+    const mark = (name, path, i, symbol, ink) => ({
+      type: "scatter", mode: "markers", name, x: [column(path.x).at(i)], y: [column(path.z).at(i)], hoverinfo: "skip",
+      marker: { symbol, size: 9, color: colour("page"), line: { color: ink, width: 2 } }, showlegend: path === data.paths[0],
+    });
+    const ends = data.paths.map((path) => mark("end", path, -1, "square", colour(path.name)));
+    return [mark("start", data.paths[0], 0, "circle", colour("ink")), ...ends];
+  }
+
   function drawMap() {
     const traces = pathTraces((path, name, style, valued) => ({
       type: "scatter", name, x: column(path.x), y: column(path.z), customdata: places(path),
@@ -200,7 +210,7 @@
       ...(valued ? { marker: scale(path, 5) } : {}),
     }));
     traces.push(...loopTraces({ x: (path, i) => column(path.x)[i], y: (path, i) => column(path.z)[i] }, "scatter"));
-    traces.push(...fixTraces("scatter", (fixes) => ({ x: column(fixes.x), y: column(fixes.z) })));
+    traces.push(...fixTraces("scatter", (fixes) => ({ x: column(fixes.x), y: column(fixes.z) })), ...endTraces());
     return Plotly.react(document.querySelector("#map .plot"), traces, layout({
       xaxis: axis("x, right of the first camera [m]"), yaxis: axis("z, ahead [m]", { scaleanchor: "x" }),
       hovermode: "closest", uirevision: "keep",

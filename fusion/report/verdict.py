@@ -12,15 +12,17 @@ from scipy.stats import chi2
 
 from fusion.evaluation import ANEES_DIMENSIONS, CONFIDENCE, MIN_VARIANCE, Metrics, consistency, errors_by_sigmas
 from fusion.report.content import ReportContent
-from fusion.table import HEADINGS
-from fusion_io.records import FloatArray, IntArray, Trajectory
+from fusion.table import HEADINGS, turned_deg
+from fusion_io.records import NIS_DEGREES_OF_FREEDOM, FloatArray, IntArray, Trajectory
 from fusion_io.words import counted, metres
 
 Status = Literal["good", "caution", "bad"]
 
-NIS_DEGREES_OF_FREEDOM = 6
 DISAGREEMENT = 3.0  # standard deviations
 NAMED_DOUBTS = 3  # of a kind; of more it is said how many
+
+PLACES = ("right", "left"), ("below", "above"), ("ahead", "behind")
+TURNS = ("right", "left"), ("up", "down"), ("clockwise", "counterclockwise")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +72,9 @@ def verdict(content: ReportContent) -> Verdict:
     quality, status = judgement(content)
     found = [_imu(content)]
     if faults:
-        found.append(
-            "found " + ", ".join(kind if count == 1 else f"{kind} ({count})" for kind, count in faults.items())
-        )
+        # A stretch of wrong pairs is one time: how many pairs are in it, its event says.
+        often = (kind if count == 1 else f"{kind} ({count} times)" for kind, count in faults.items())
+        found.append(f"found {', '.join(often)}")
     if content.warnings:
         found.append(counted(len(content.warnings), "warning"))
     lines = (*doubted, quality, _end(content), "; ".join(found))
@@ -108,21 +110,20 @@ def _damage(content: ReportContent) -> str:
 
 
 def _end(content: ReportContent) -> str:
-    """Where the headline's trajectory ends, in the axes of the first camera (x right, y down, z ahead)."""
+    """Where the headline's trajectory ends, in the axes of the first camera (x right, y down, z ahead), how turned."""
     trajectory = content.trajectories[content.headline]
-    sides = (("right", "left"), ("below", "above"), ("ahead", "behind"))
-    places = [
-        f"{abs(value):.1f} m {side[bool(value < 0.0)]}"
-        for value, side in zip(trajectory.poses.translation[-1].tolist(), sides, strict=True)
-    ]
-    stated = _stated_at_end(trajectory)
-    sigma = "" if stated is None else f" (stated sigma {metres(stated)})"
-    return f"at the end the camera was {', '.join(places)} of where it began{sigma}"
+    place = _on_sides(trajectory.poses.translation[-1].tolist(), "m", PLACES)
+    turn = _on_sides(turned_deg(trajectory.poses.rotation[-1]), "deg", TURNS)
+    of_place = of_turn = ""
+    if (sigmas := trajectory.end_sigmas) is not None:
+        of_place = f" (stated sigma {metres(sigmas[0])})"
+        of_turn = f" (stated sigma {np.rad2deg(sigmas[1]):.2g} deg)"
+    return f"at the end the camera was {place} of where it began{of_place}, turned {turn}{of_turn}"
 
 
-def _stated_at_end(trajectory: Trajectory) -> float | None:
-    """Root of the summed variances of the last position."""
-    return None if trajectory.covariances is None else float(np.sqrt(np.trace(trajectory.covariances[-1, 3:, 3:])))
+def _on_sides(values: Sequence[float], unit: str, sides: Sequence[tuple[str, str]]) -> str:
+    """Sizes of values, each with the side that it is on: the first of two where it is positive."""
+    return ", ".join(f"{abs(value):.1f} {unit} {side[value < 0.0]}" for value, side in zip(values, sides, strict=True))
 
 
 def agreements(content: ReportContent) -> list[Agreement]:

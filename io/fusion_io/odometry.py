@@ -12,7 +12,7 @@ import numpy as np
 
 from fusion_io import encodings, messages, poses, topics
 from fusion_io.container import Channel, Contents, MessageFile
-from fusion_io.errors import LogError
+from fusion_io.errors import LogError, UsageError
 from fusion_io.records import Trajectory
 from fusion_io.recovery import scan
 from fusion_io.words import counted
@@ -96,7 +96,8 @@ def _read(path: Path, contents: Contents, channel: Channel) -> tuple[Trajectory,
 def trajectory_on(path: Path, recorded: RecordedTrajectories, topic: str | None) -> Trajectory:
     """The trajectory on a topic, or without one the only trajectory that a log holds.
 
-    Raises LogError, with those that there are, where it holds none on the topic, or several and none is named.
+    Raises UsageError, with those that there are, where it holds none on the topic, and LogError where none is named and
+    it does not hold one.
     """
     known = dict(recorded.trajectories)
     if recorded.ground_truth is not None:
@@ -107,7 +108,8 @@ def trajectory_on(path: Path, recorded: RecordedTrajectories, topic: str | None)
         return known[name_of(topic)]
     asked = "which of its trajectories?" if topic is None else f"no trajectory on {topic}."
     choose = "; choose one with --topic" if known else ""
-    raise LogError(f"{path}: {asked} It holds {', '.join(known) or 'none'}{choose}")
+    error = LogError if topic is None else UsageError
+    raise error(f"{path}: {asked} It holds {', '.join(known) or 'none'}{choose}")
 
 
 def only_trajectory(path: Path, recorded: RecordedTrajectories) -> Trajectory:

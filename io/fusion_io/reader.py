@@ -54,7 +54,7 @@ def open_log(path: str | Path, topics: Mapping[str, str] | None = None) -> Log:
 
     Raises:
         LogError: not an MCAP file, nothing in it that can be used, or two topics for one role; in one line.
-        UsageError: ``topics`` names a role that does not exist.
+        UsageError: ``topics`` names a role that does not exist, or a topic that cannot play it.
 
     """
     path = Path(path)

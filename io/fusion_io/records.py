@@ -165,9 +165,21 @@ class Trajectory:
         near = known[after] - known[after - 1] <= LONGEST_INTERPOLATION_S * NANOSECONDS
         return np.asarray(inside & (exact | near))
 
+    @property
+    def end_sigmas(self) -> tuple[float, float] | None:
+        """Roots of the summed variances of the last position (m) and orientation (rad); None without covariances."""
+        if self.covariances is None:
+            return None
+        variances = np.diag(self.covariances[-1])
+        return float(np.sqrt(variances[3:].sum())), float(np.sqrt(variances[:3].sum()))
+
     def relative_to_first(self) -> Trajectory:
         """The same trajectory in the frame of its first pose (covariances are in body axes: kept)."""
         return Trajectory(self.stamps_ns, self.poses[0].inv() * self.poses, self.covariances)
+
+
+NIS_DEGREES_OF_FREEDOM = 6
+"""Of a pair: what its NIS is on average where all is modelled right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +209,12 @@ class EstimatorSeries:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def nis_mean(self) -> float | None:
+        """Mean NIS of the pairs that have one, rejected ones too; None without any."""
+        known = self.nis[np.isfinite(self.nis)]
+        return float(known.mean()) if len(known) else None
 
     @property
     def knows_imu(self) -> bool:

@@ -170,8 +170,10 @@ class _Scan:
                 if following is None:
                     self._end_early(position)
                     return
-                name = "bad_chunks" if isinstance(broken, _BrokenChunkError) else "bad_records"
-                self._note(name, f"the record at byte {position} is damaged ({broken}): read on from byte {following}")
+                self._note(
+                    "bad_chunks" if isinstance(broken, _BrokenChunkError) else "bad_records",
+                    f"the record at byte {position} is damaged ({broken}): read on from byte {following}",
+                )
                 previous = position = following
 
     def _read_record(self, position: int) -> int:

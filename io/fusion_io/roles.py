@@ -100,8 +100,8 @@ def assign(path: str, candidates: Sequence[Topic], chosen: Mapping[str, str]) ->
     """Role -> topic, for all roles that the log can fill.
 
     Raises:
-        LogError: two topics could play a role (all such roles are named), or a chosen one is not there or does not fit.
-        UsageError: a role that does not exist was chosen.
+        LogError: two topics could play a role (all such roles are named).
+        UsageError: a role that does not exist was chosen, or a topic that is not there or does not fit.
 
     """
     roles = {role: _chosen(path, candidates, role, topic) for role, topic in chosen.items()}
@@ -133,7 +133,7 @@ def _chosen(path: str, candidates: Sequence[Topic], role: str, topic: str) -> st
         if candidate.name == topic and candidate.message_type in _READABLE[role]:
             return topic
     fitting = [candidate for candidate in candidates if candidate.message_type in _READABLE[role]]
-    raise LogError(f"{path}: topic {topic} cannot be the {_words(role)}; {_list(fitting) or 'no topic'} could be")
+    raise UsageError(f"{path}: topic {topic} cannot be the {_words(role)}; {_list(fitting) or 'no topic'} could be")
 
 
 def _fitting(role: str, candidates: Sequence[Topic], roles: Mapping[str, str]) -> list[Topic]:

@@ -145,6 +145,8 @@ def test_the_page_is_written_and_json_goes_to_a_pipe(drive: Any, tmp_path: Path)
         (["empty.mcap"], 1, "empty.mcap: the file is empty"),
         (["nothing.mcap"], 1, "nothing.mcap: cannot be read: No such file or directory"),
         (["good.mcap", "--topic", "wheel=/x"], 2, "there is no role 'wheel'"),
+        (["good.mcap", "--topic", "imu=/nope"], 2, "topic /nope cannot be the imu; /imu could be"),
+        (["good.mcap", "--topic", "imu=/ground_truth"], 2, "topic /ground_truth cannot be the imu; /imu could be"),
         (["good.mcap", "--html", "text.txt/page.html"], 1, "page.html: cannot be written"),
     ],
 )
@@ -161,13 +163,6 @@ def test_what_cannot_be_done_is_said_in_one_line(
     assert message in error
     assert error.startswith("error: ")
     assert error.count("\n") == 1
-
-
-def test_a_topic_that_cannot_play_a_role_makes_the_log_not_usable(drive: Any, tmp_path: Path) -> None:
-    code, document = analysed(drive.write(tmp_path / "a.mcap"), "--topic", "imu=/camera/image")
-    assert code == 1
-    assert document["verdict"]["answer"] == "not usable"
-    assert reasons(document, "blocks") == ["None: topic /camera/image cannot be the imu; /imu could be"]
 
 
 def test_every_foreign_log_is_analysed(shared_data: Path, tmp_path: Path) -> None:

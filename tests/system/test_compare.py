@@ -4,13 +4,15 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from numpy.testing import assert_allclose
 
-from fusion import compare, replay, run
+from fusion import compare, replay, run, table
+from fusion.output import Outcome
 from fusion_io.odometry import read_trajectories
 from fusion_io.trajectory_files import read_tum
 
@@ -49,11 +51,11 @@ def test_a_run_compared_from_its_log_has_the_measures_that_it_wrote_itself(
     written = json.loads((folder / "metrics.json").read_text())["trajectories"]
     for each in document["inputs"]:
         assert each["trajectories"].keys() == written.keys()
-        for name, measures in written.items():
+        for name, measures in each["trajectories"].items():
             for measure, value in measures.items():
-                assert_allclose(each["trajectories"][name][measure], value, rtol=1e-6, atol=1e-9)
+                assert_allclose(value, written[name][measure], rtol=1e-6, atol=1e-9)
     for difference in document["differences"]:
-        assert difference["t_rel_percent"]["verdict"] == "no difference"
+        assert difference["t_rel_percent"]["verdict"] == "not significant"
 
 
 def test_conditions_decide_the_exit_code(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,6 +108,28 @@ def test_a_replay_of_a_cut_run_says_so_and_ends_with_3(
     assert any("cut.mcap" in line and "cut or unfinished" in line for line in lines), lines
 
 
+def test_a_replay_says_what_its_run_said_of_the_end_and_of_all_figures(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where the settings are the same. The log is the run's own, and the time is another."""
+    assert replay.main([str(folder), "--out", str(tmp_path)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    ends = table.end_lines({name: read_tum(folder / f"{name}.tum") for name in ("raw", "posegraph", "ekf")})
+    assert [line for line in told if line.startswith(("At the end", "Turned"))] == ends
+    run_said, said = (json.loads((each / "metrics.json").read_text()) for each in (folder, tmp_path))
+    assert said.keys() == run_said.keys()
+    assert said.pop("log").keys() == run_said.pop("log").keys()
+    assert said.pop("timing").keys() == {"replay", "total", "realtime_factor"} <= {"replay", *run_said.pop("timing")}
+    measured, run_measured = said.pop("trajectories"), run_said.pop("trajectories")
+    assert measured.keys() == run_measured.keys()
+    for name, measures in run_measured.items():
+        near = {
+            measure: value if value is None else pytest.approx(value, rel=1e-6) for measure, value in measures.items()
+        }
+        assert measured[name] == near
+    assert said == run_said
+
+
 def test_a_replay_with_unchanged_settings_gives_the_recorded_trajectories(folder: Path, tmp_path: Path) -> None:
     assert replay.main([str(folder), "--out", str(tmp_path)]) == 0
     for name in ("raw", "posegraph", "ekf"):
@@ -148,9 +172,10 @@ def test_a_back_end_that_fails_with_a_setting_is_said_and_does_not_end_the_sweep
 ) -> None:
     again = replay.fuse_again
 
-    def failing(log: Any, config: Any) -> tuple[dict[str, Any], list[str]]:
-        trajectories, notes = again(log, config)
-        return ({"raw": trajectories["raw"]} if config.posegraph.gyro_noise > 1.0 else trajectories), notes
+    def failing(log: Any, config: Any) -> Outcome:
+        outcome = again(log, config)
+        raw = {"raw": outcome.trajectories["raw"]}
+        return replace(outcome, trajectories=raw) if config.posegraph.gyro_noise > 1.0 else outcome
 
     monkeypatch.setattr(replay, "fuse_again", failing)
     assert replay.main([str(folder), "--grid", "posegraph.gyro_noise=2.0,1e-3"]) == 0

@@ -100,7 +100,7 @@ def test_a_replay_of_the_run_finds_the_same_from_the_fixes_that_it_kept(finished
     _, folder = finished
     log = open_log(folder / "run.mcap")
     assert len(log.gnss()) == 15
-    trajectories, _ = fuse_again(log, CONFIG)
+    trajectories = fuse_again(log, CONFIG).trajectories
     recorded = read_trajectory(folder / "posegraph.tum", None).poses.translation
     assert_allclose(trajectories["posegraph"].poses.translation, recorded, atol=1e-5)
 
