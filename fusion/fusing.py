@@ -38,6 +38,8 @@ def measurements(
     inertial = in_camera_axes(imu, calibration) if calibration.used else None
     faulty = len(calibration.faulty_ns)
     findings.put("imu_faulty_stretches", faulty, f"faulty stretches of the IMU, left out: {faulty}")
+    jumps = [f"{jump.by_s:+.3f} s" for jump in calibration.clock_jumps]
+    findings.put("imu_clock_jumps", len(jumps), f"jumps of the IMU's clock, taken out of it: {', '.join(jumps)}")
     steps, gaps = chain.bridge_gaps(frame_stamps, pairs, inertial)
     longest_s, at_s = longest_gap(pairs)
     where = f"; the longest: {longest_s:.1f} s from {at_s:.1f} s" if longest_s > 0.0 else ""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -57,6 +57,7 @@ JUMP_GUARD_S = 1.0
 MAX_SMALL_JUMPS = 3  # of a clock
 SMALL_JUMP_PRIOR_S, STEP_PRIOR = 1.0, 0.1  # by about so much a clock jumps, and beside it the gyro's bias steps (rad/s)
 SMALL_JUMP_EDGE_S = 5.0  # before a jump, and after it
+MIN_JUMP_S = 0.01  # smaller ones do no harm, and a front end's own delay can change by some milliseconds
 # How many times likelier (logarithm) a jump has to make what was seen. Sound logs and those with other faults have at
 # most 5.5 for one; a jump of 50 ms in 25 s has 7 or more, one of 0.1 s 19.
 LEAST_BY_JUMP = 6.0
@@ -174,13 +175,16 @@ class ImuCalibration:
     @property
     def clock_jumps(self) -> list[clocks.Jump]:
         """Where the clock jumped, in order of time."""
-        found, ahead_ns = [], round(self.time_offset_s * NANOSECONDS)
-        for change in self.changes:
-            after_ns = ahead_ns + change.clock_ns
-            if change.clock_ns:
-                found.append(clocks.Jump(change.at_ns - ahead_ns, ahead_ns / NANOSECONDS, after_ns / NANOSECONDS))
-            ahead_ns = after_ns
-        return found
+        jumped = [change for change in self.changes if change.clock_ns]
+        if not jumped:
+            return []
+        ahead_ns = np.cumsum(
+            [round(self.time_offset_s * NANOSECONDS), *(change.clock_ns for change in jumped)]
+        ).tolist()
+        return [
+            clocks.Jump(change.at_ns - before_ns, before_ns / NANOSECONDS, after_ns / NANOSECONDS)
+            for change, (before_ns, after_ns) in zip(jumped, pairwise(ahead_ns), strict=True)
+        ]
 
     @property
     def bias_steps(self) -> list[BiasStep]:
@@ -664,7 +668,7 @@ def _small_jump(
         step_s = float(_jumps_before(fit, np.array([row]))[1][0])
         if abs(step_s) < JUMP_CONVERGED_S:
             break
-    return float(start_s[row]), jumped_s
+    return (float(start_s[row]), jumped_s) if abs(jumped_s) > MIN_JUMP_S else None
 
 
 def _jumps_before(fit: _Fit, rows: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:

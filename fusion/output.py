@@ -222,6 +222,7 @@ def metrics_document(outcome: Outcome, seconds: Mapping[str, float]) -> dict[str
         "at_end": {name: _at_end(each) for name, each in outcome.trajectories.items()},
         "calibration": _calibration(calibration, placement(calibration, outcome.mounting)),
         "bias_steps": [_bias_step(step) for step in outcome.bias_steps if step.is_known],
+        "clock_jumps": [{"stamp_ns": jump.at_ns, "by_s": jump.by_s} for jump in calibration.clock_jumps],
         "front_end": {"scale_sigma": next((sigma[0] for sigma in told if sigma), None)},
         "gnss": None if outcome.georeference is None else _georeference(outcome.georeference),
         "timing": {**seconds, "total": total, "realtime_factor": outcome.duration_s / total},

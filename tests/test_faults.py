@@ -180,6 +180,7 @@ def test_a_small_clock_jump_is_found_in_a_short_drive_too(by_s: float, seconds: 
     sound = _fused(log)
     result = _fused(replace(log, imu=faults.clock_jump(log.imu, seconds / 2, by_s)))
     (jump,) = result.calibration.clock_jumps
+    assert result.findings.counts["imu_clock_jumps"] == 1
     assert abs(jump.by_s - by_s) < 0.015
     assert abs((jump.at_ns - log.truth.stamps_ns[0]) / NANOSECONDS - seconds / 2) <= 2.0
     for name in ("posegraph", "ekf"):
@@ -294,6 +295,7 @@ def test_a_short_log_may_be_as_rough_as_a_stretch_of_its_length(monkeypatch: pyt
 REAL_FAULTS: dict[str, Callable[[ImuSeries], ImuSeries]] = {
     "bias step": lambda imu: faults.gyro_bias_step(imu, 80.0, BIAS_STEP),
     "clock jump": lambda imu: faults.clock_jump(imu, 80.0, 0.3),
+    "small clock jump": lambda imu: faults.clock_jump(imu, 80.0, 0.05),
 }
 
 
@@ -307,4 +309,5 @@ def test_a_faulty_imu_makes_a_published_odometry_no_worse(fault: str, shared_dat
     truth = read_kitti(odometry / "poses" / "09.txt", stamps)
     result = _fused(Log(truth, pairs, REAL_FAULTS[fault](imu)))
     assert result.calibration.used, result.calibration.reason
+    assert len(result.calibration.clock_jumps) == ("clock jump" in fault)
     _assert_no_worse(result)

@@ -118,7 +118,8 @@ def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.O
     output.write_metrics(tmp_path, outcome, SECONDS)
     document = json.loads((tmp_path / "metrics.json").read_text())
     assert document.keys() == {
-        *("schema", "log", "trajectories", "at_end", "calibration", "bias_steps", "front_end", "gnss", "timing")
+        *("schema", "log", "trajectories", "at_end", "calibration", "bias_steps", "clock_jumps"),
+        *("front_end", "gnss", "timing"),
     }
     assert document["schema"] == 1
     assert document["log"] == {
@@ -158,6 +159,7 @@ def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.O
         "reason": "it agrees with the pairs",
     }
     assert document["bias_steps"] == []
+    assert document["clock_jumps"] == []
     assert document["timing"] == {**SECONDS, "total": 2.0, "realtime_factor": pytest.approx(0.55)}
 
 
@@ -174,6 +176,16 @@ def test_metrics_json_has_all_steps_of_biases_that_are_known(tmp_path: Path, out
     assert output.metrics_document(stepped, SECONDS)["bias_steps"] == [
         {"stamp_ns": 1_000_000_000, "accelerometer_m_s2": [0.0, 0.0, 0.0], "gyro_rad_s": [0.0, 0.02, 0.0]},
         {"stamp_ns": 2_000_000_000, "accelerometer_m_s2": [0.5, 0.0, -0.5], "gyro_rad_s": [0.0, 0.0, 0.0]},
+    ]
+
+
+def test_metrics_json_has_jumps_of_the_clock_on_that_of_the_camera(outcome: output.Outcome) -> None:
+    """The second one happens where the first has moved the stamps to."""
+    changes = [Change(1_065_000_000, 50_000_000, np.zeros(3)), Change(2_115_000_000, -20_000_000, np.zeros(3))]
+    jumped = replace(outcome, calibration=replace(outcome.calibration, changes=changes))
+    assert output.metrics_document(jumped, SECONDS)["clock_jumps"] == [
+        {"stamp_ns": 1_000_000_000, "by_s": pytest.approx(0.05)},
+        {"stamp_ns": 2_000_000_000, "by_s": pytest.approx(-0.02)},
     ]
 
 
