@@ -34,6 +34,7 @@ class Batch(ABC):
         self.judged = judged
         self.least_weight = 0.0
         self.dimension = dimension
+        self._unit = gtsam.noiseModel.Unit.Create(dimension)
         self._keys = keys
         self._errors = np.zeros((len(keys), dimension))
         self._jacobians: list[FloatArray] = []
@@ -66,8 +67,7 @@ class Batch(ABC):
 
     def factor(self, row: int) -> gtsam.NonlinearFactor:
         """One of the factors."""
-        noise = gtsam.noiseModel.Unit.Create(self.dimension)
-        return gtsam.CustomFactor(noise, list(self._keys[row]), self._lookup(row))
+        return gtsam.CustomFactor(self._unit, list(self._keys[row]), self._lookup(row))
 
     def _lookup(self, row: int) -> Callable[..., FloatArray]:
         variables = range(len(self._keys[row]))
