@@ -464,7 +464,7 @@ def fuse(log: Log, config: RunConfig = DEFAULTS, with_imu: bool = True) -> Fused
     """Both back ends on the recorded pairs and loops of a log, as a run does it."""
     pairs, samples, truth = log.pairs(), log.imu(), _truth(log)
     mounting, findings = main_job.known_mounting(log, config.imu), Findings()
-    calibration = calibrate(pairs, samples, mounting, config.imu.time_offset_s)
+    calibration = calibrate(pairs, samples, mounting, config.imu.time_offset_s, config.imu.low_pass_s)
     if not with_imu:
         calibration = replace(calibration, used=False)
     known = fusing.measurements(pairs, samples, calibration, log.frame_stamps(), findings)

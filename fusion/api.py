@@ -53,7 +53,7 @@ def fuse(
     """
     config = (config or RunConfig()).model_copy(update={} if backend == "raw" else {"backend": backend})
     samples = _NO_IMU if imu is None else imu
-    calibration = calibrate(pairs, samples, mounting, config.imu.time_offset_s)
+    calibration = calibrate(pairs, samples, mounting, config.imu.time_offset_s, config.imu.low_pass_s)
     stamps_ns = _NO_STAMPS if frame_stamps is None else frame_stamps
     findings = Findings()
     known = fusing.measurements(pairs, samples, calibration, stamps_ns, findings)

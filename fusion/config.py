@@ -68,11 +68,13 @@ class ImuConfig(Section):
     """What is known about the IMU; whatever is None is estimated from the log.
 
     rotation_imu_camera_quat_wxyz turns camera vectors into IMU vectors (v_imu = R v_camera); time_offset_s is
-    t_imu - t_camera of one event.
+    t_imu - t_camera of one event. low_pass_s: time constant of a low-pass filter in the IMU, whose delay is a part of
+    the offset; 0 for an IMU without one.
     """
 
     rotation_imu_camera_quat_wxyz: tuple[float, float, float, float] | None = None
     time_offset_s: float | None = None
+    low_pass_s: NotNegative | None = None
 
     @field_validator("rotation_imu_camera_quat_wxyz")
     @classmethod

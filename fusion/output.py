@@ -237,6 +237,7 @@ def _calibration(found: ImuCalibration, known: Placement) -> dict[str, Any]:
         "rotation_std_deg": None if std_rad is None else np.rad2deg(std_rad).tolist(),
         "time_offset_s": known.time_offset_s,
         "time_offset_std_s": known.time_offset_std_s,
+        "low_pass_s": found.low_pass_s,
         "lever_arm_m": None if known.lever_arm_m is None else known.lever_arm_m.tolist(),
         "lever_arm_std_m": None if known.lever_arm_std_m is None else known.lever_arm_std_m.tolist(),
         "gyro_bias_rad_s": known.gyro_bias.tolist(),

@@ -211,7 +211,9 @@ def fuse_again(log: Log, config: RunConfig) -> Outcome:
     if not pairs:
         raise LogError(f"{log.path}: no recorded pair estimates to replay: run fusion.run on it first")
     findings = Findings()
-    calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
+    calibration = imu.calibrate(
+        pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s, config.imu.low_pass_s
+    )
     known = fusing.measurements(pairs, samples, calibration, log.frame_stamps(), findings)
     skips = fusing.between_steps(log.skips(), known.steps)
     positions = gnss.positions(fixes, config.gnss, findings)

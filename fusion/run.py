@@ -85,7 +85,9 @@ def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentatio
     pairs, levels = pair_estimates(log, samples, config.frontend, findings, folder)
     stopwatch.lap("pairs")
 
-    calibration = imu.calibrate(pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s)
+    calibration = imu.calibrate(
+        pairs, samples, known_mounting(log, config.imu), config.imu.time_offset_s, config.imu.low_pass_s
+    )
     stopwatch.lap("calibration")
 
     known = fusing.measurements(pairs, samples, calibration, frame_stamps(log, pairs, findings), findings)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.signal import bilinear, lfilter, lfilter_zi
 from scipy.spatial.transform import RigidTransform
 
 from fusion_io.front_end_noise import with_noise
@@ -101,6 +102,19 @@ def swinging_accelerometer(imu: ImuSeries, by: FloatArray, period_s: float) -> I
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) / NANOSECONDS
     swing = np.sin(2 * np.pi * seconds / period_s)[:, None] * by
     return replace(imu, linear_acceleration=imu.linear_acceleration + swing)
+
+
+def low_passed(imu: ImuSeries, low_pass_s: float) -> ImuSeries:
+    """All that it shows has gone through a low-pass filter of first order."""
+    numerator, denominator = bilinear([1.0], [low_pass_s, 1.0], IMU_HZ)
+    settled = lfilter_zi(numerator, denominator)[:, None]
+
+    def filtered(values: FloatArray) -> FloatArray:
+        return np.asarray(lfilter(numerator, denominator, values, axis=0, zi=settled * values[:1])[0])
+
+    return replace(
+        imu, angular_velocity=filtered(imu.angular_velocity), linear_acceleration=filtered(imu.linear_acceleration)
+    )
 
 
 def clock_jump(imu: ImuSeries, at_s: float, by_s: float) -> ImuSeries:

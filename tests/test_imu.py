@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from fusion.chain import ImuWindows
@@ -73,9 +74,58 @@ def _car(seconds: float = 120.0) -> Log:
     return _log(motion, seconds, ImuModel(time_offset_s=0.03, gyro_bias=BIAS))
 
 
+@cache
+def _shaken(seconds: float = 40.0) -> Log:
+    """The same hand, which trembles a little, fast."""
+    times = np.arange(-1.5, seconds + 1.5, 0.05)
+    slow = _rich(seconds).poses(times)
+    trembling = Rotation.from_rotvec(0.01 * np.sin(2 * np.pi * times[:, None] * [1.3, 1.7, 2.1]))
+    motion = Motion(times, RigidTransform.from_components(slow.translation, slow.rotation * trembling))
+    return _log(motion, seconds, ImuModel(MOUNTING, time_offset_s=0.01, gyro_bias=BIAS))
+
+
 def _angle(one: Rotation | None, other: Rotation) -> float:
     assert one is not None
     return float((one.inv() * other).magnitude())
+
+
+@pytest.mark.parametrize("low_pass_s", [0.05, 0.08])
+def test_a_low_pass_filter_is_found_and_undone(low_pass_s: float) -> None:
+    """To a tenth; the offset is that of slow motion, and a quarter at most is left of what the filter did to rates."""
+    log = _shaken()
+    filtered = faults.low_passed(log.imu, low_pass_s)
+    calibration = calibrate(log.pairs, filtered, None, None)
+    assert calibration.low_pass_s == pytest.approx(low_pass_s, rel=0.1)
+    assert calibration.time_offset_s == pytest.approx(0.01 + low_pass_s, abs=3e-3)
+    assert f"filter of {1e3 * calibration.low_pass_s:.0f} ms is undone" in calibration.reason
+    given_offset = calibrate(log.pairs, filtered, None, 0.01 + low_pass_s)
+    assert given_offset.low_pass_s == pytest.approx(low_pass_s, rel=0.1)
+
+    at_s = np.linspace(2.0, 38.0, 2000)
+    sound, blurred, undone = (
+        _smooth_rates(in_camera_axes(imu, known), at_s)
+        for imu, known in (
+            (log.imu, calibrate(log.pairs, log.imu, None, None)),
+            (filtered, replace(calibration, low_pass_s=0.0)),
+            (filtered, calibration),
+        )
+    )
+    assert np.std(undone - sound) < 0.25 * np.std(blurred - sound)
+
+
+def _smooth_rates(imu: ImuSeries, at_s: FloatArray) -> FloatArray:
+    """At some times, without the noise of single samples."""
+    seconds = (imu.stamps_ns - START_NS) / NANOSECONDS
+    return np.stack([np.interp(at_s, seconds, uniform_filter1d(axis, 5)) for axis in imu.angular_velocity.T], axis=1)
+
+
+def test_an_imu_without_a_low_pass_filter_is_left_as_it_is() -> None:
+    """Nor is a filter that is given as zero looked for."""
+    for log in (_shaken(), _hand(), _car()):
+        assert calibrate(log.pairs, log.imu, None, None).low_pass_s == 0.0
+    filtered = faults.low_passed(_shaken().imu, 0.06)
+    assert calibrate(_shaken().pairs, filtered, None, None, 0.0).low_pass_s == 0.0
+    assert calibrate(_shaken().pairs, filtered, None, None, 0.05).low_pass_s == 0.05
 
 
 @pytest.mark.parametrize("offset_s", [-0.21, 0.0, 0.0657])

@@ -152,6 +152,7 @@ def test_metrics_json_has_the_documented_shape(tmp_path: Path, outcome: output.O
         "rotation_std_deg": None,
         "time_offset_s": 0.065,
         "time_offset_std_s": None,
+        "low_pass_s": 0.0,
         "lever_arm_m": None,
         "lever_arm_std_m": None,
         "gyro_bias_rad_s": [0.0, 0.0, 0.0],
