@@ -111,7 +111,7 @@ class FusionConfig(Section):
     learned_pair_scale_sigma: PositiveFloat = 0.005
     pair_scale_correlation_s: PositiveFloat = 10.0
     pair_rate_bias_sigma: PositiveFloat = 3e-3
-    learned_pair_rate_bias_sigma: PositiveFloat = 1e-3
+    learned_pair_rate_bias_sigma: PositiveFloat = 5e-4
     pair_rate_bias_correlation_s: PositiveFloat = 10.0
     pair_misalignment_sigma: PositiveFloat = 7.5e-3
     lever_arm_sigma: PositiveFloat = 1.0
