@@ -243,7 +243,7 @@ def calibrate(
         return left_out("its gyro or accelerometer hangs, or is at the end of its range")
     changes, doubtful_ns = _clock_jumps(imu, pairs)
     estimate_offset = time_offset_s is None
-    for _ in range(MAX_SMALL_JUMPS + 1):
+    for may_jump in (*[True] * MAX_SMALL_JUMPS, False):
         good = _unchanged(_outside(imu, doubtful_ns), changes)
         fitted = _fitted(good, pairs, rotation, time_offset_s)
         if isinstance(fitted, str):
@@ -256,6 +256,8 @@ def calibrate(
             if isinstance(fitted, str):
                 return left_out(fitted)
         fit, steps, bias_std = _without_bias_steps(good, fitted, rotation, estimate_offset=estimate_offset)
+        if not may_jump:
+            break
         jump = _small_jump(_Gyro(_unchanged(good, steps)), fit, rotation, estimate_offset=estimate_offset)
         if jump is None:
             break
