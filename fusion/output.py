@@ -20,11 +20,12 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from fusion import plots, report
+from fusion.chain import chain
 from fusion.config import RunConfig, to_toml
-from fusion.evaluation import Metrics
+from fusion.evaluation import Metrics, evaluate
 from fusion.gnss import Georeference
 from fusion.imu import BiasStep, ImuCalibration
-from fusion.measurements import Estimate, Mounting
+from fusion.measurements import Estimate, Measurements, Mounting
 from fusion.placement import Placement, placement, refined_mounting
 from fusion_io.errors import LogError, UsageError
 from fusion_io.findings import Findings
@@ -76,6 +77,25 @@ class Outcome:
     gnss: Sequence[GnssFix] = ()
     skips: Sequence[PairEstimate] = ()
     levels: Sequence[PairEstimate] = ()
+
+    @classmethod
+    def of(
+        cls,
+        log: Log,
+        config: RunConfig,
+        read: tuple[ImuSeries, list[PairEstimate], Trajectory | None, Sequence[GnssFix]],
+        calibration: ImuCalibration,
+        known: Measurements,
+        estimates: Mapping[str, Estimate],
+        findings: Findings,
+        levels: Sequence[PairEstimate] = (),
+    ) -> Outcome:
+        """From what back ends made of what was known, with raw beside it; read: IMU, pairs, ground truth, positions."""
+        imu, pairs, truth, fixes = read
+        trajectories = {"raw": chain(known.steps)} | {name: each.trajectory for name, each in estimates.items()}
+        metrics = {name: evaluate(each, truth, config.segment_lengths_m) for name, each in trajectories.items()}
+        found = (calibration, trajectories, estimates, metrics, findings)
+        return cls(log, config, imu, pairs, truth, *found, known.loops, fixes, known.skips, levels)
 
     @property
     def mounting(self) -> Mounting | None:

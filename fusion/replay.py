@@ -201,8 +201,7 @@ def replay(log: Log, settings: Settings, config: RunConfig) -> Replay:
 
 def fuse_again(log: Log, config: RunConfig) -> Outcome:
     """What a run makes of the recorded pairs, IMU, loops and positions; a log without pairs raises LogError."""
-    from fusion import chain, fusing, gnss, imu
-    from fusion.evaluation import evaluate
+    from fusion import fusing, gnss, imu
     from fusion.output import Outcome
     from fusion.run import known_mounting
     from fusion_io.findings import Findings
@@ -219,23 +218,7 @@ def fuse_again(log: Log, config: RunConfig) -> Outcome:
     positions = gnss.positions(fixes, config.gnss, findings)
     known = replace(known, skips=skips, loops=log.loops(), gnss=positions)
     estimates = fusing.fuse(known, config, findings)
-    trajectories = {"raw": chain.chain(known.steps)} | {name: each.trajectory for name, each in estimates.items()}
-    metrics = {name: evaluate(each, truth, config.segment_lengths_m) for name, each in trajectories.items()}
-    return Outcome(
-        log,
-        config,
-        samples,
-        pairs,
-        truth,
-        calibration,
-        trajectories,
-        estimates,
-        metrics,
-        findings,
-        known.loops,
-        fixes,
-        known.skips,
-    )
+    return Outcome.of(log, config, (samples, pairs, truth, fixes), calibration, known, estimates, findings)
 
 
 def recorded_result(log: Log) -> Result | None:

@@ -75,7 +75,6 @@ def run(log_path: Path, out: Path | None, config: RunConfig, presentation: Prese
 def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentation, stopwatch: Stopwatch) -> int:
     """All that is done with a log that could be opened; the results go to the folder. Returns the exit code."""
     from fusion import chain, fusing, gnss, imu, output
-    from fusion.evaluation import evaluate
     from fusion_io.findings import Findings
 
     samples, fixes, ground_truth = log.imu(), log.gnss(), log.ground_truth()
@@ -109,26 +108,10 @@ def compute(log: Log, folder: Path, config: RunConfig, presentation: Presentatio
     estimates = fusing.fuse(known, config, findings)
     stopwatch.lap("fusion")
 
-    trajectories = {"raw": raw} | {name: estimate.trajectory for name, estimate in estimates.items()}
-    metrics = {name: evaluate(each, ground_truth, config.segment_lengths_m) for name, each in trajectories.items()}
+    read = (samples, pairs, ground_truth, fixes)
+    outcome = output.Outcome.of(log, config, read, calibration, known, estimates, findings, levels)
     stopwatch.lap("evaluation")
 
-    outcome = output.Outcome(
-        log,
-        config,
-        samples,
-        pairs,
-        ground_truth,
-        calibration,
-        trajectories,
-        estimates,
-        metrics,
-        findings,
-        known.loops,
-        fixes,
-        known.skips,
-        levels,
-    )
     output.write_log(folder, outcome)
     output.write_text(folder, outcome)
     stopwatch.lap("writing")

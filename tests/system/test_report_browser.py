@@ -161,7 +161,7 @@ def test_pointing_at_a_time_marks_it_everywhere(page: Any) -> None:
     _wait(lambda: abs(_seconds(page) - 17.3) < 0.2, "the cursor")
     now = _seconds(page)
     assert np.allclose(_marked(page), now, atol=0.01)
-    i, place, here = page.execute_script(
+    i, place, here, pixel = page.execute_script(
         """const plot = document.querySelector('#map .plot');
         const mark = plot.querySelector('.place').style;
         const { xaxis, yaxis } = plot._fullLayout;
@@ -169,10 +169,11 @@ def test_pointing_at_a_time_marks_it_everywhere(page: Any) -> None:
         const place = [at(xaxis, mark.left), at(yaxis, mark.top)];
         const path = plot.data.find((trace) => trace.name === 'pose graph');
         const i = path.customdata.findIndex(([t]) => Math.abs(t - Number(document.body.dataset.seconds)) < 1e-3);
-        return [i, place, [path.x[i], path.y[i]]]"""
+        const pixel = Math.abs(xaxis.p2l(1) - xaxis.p2l(0));
+        return [i, place, [path.x[i], path.y[i]], pixel]"""
     )
     assert i == round(10 * now)
-    assert np.allclose(place, here, atol=1e-2)  # the page keeps hundredths of a pixel, of 0.7 m on a phone
+    assert np.allclose(place, here, rtol=0.0, atol=0.0055 * pixel)  # the page rounds to hundredths of a pixel
     assert f"{now:.3f} s" in page.find_element("id", "values").text
     image = page.find_element("id", "image")
     assert image.is_displayed()
